@@ -26,11 +26,12 @@ import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.linearization import value_and_jacobian
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inputs import monotone_stretches, turning_points
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
@@ -129,7 +130,7 @@ def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float])
 
 
 def _information(
-    posterior: Posterior, dataset: Dataset, free: FloatArray, sds: FloatArray
+    posterior: Posterior, dataset: Likelihood, free: FloatArray, sds: FloatArray
 ) -> FloatArray:
     """Return a record's Fisher information (physical, physical); each distinct branch counts once.
 

@@ -10,21 +10,23 @@ of the record's own. Given the other parameters all of these are jointly normal,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.errors import InputError
 from bwbayes.inference import heavy_tails
+from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.heavy_tails import Followed
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inputs import Inputs, rate
+from bwbayes.model.inputs import Inputs, Span, rate
 from bwbayes.shown import brief
 
 
@@ -75,7 +77,7 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The likelihood of one record.
+    """The likelihood of one record, from its first sample on.
 
     The readings are r = x(θ) + Σ ξᵢ fᵢ + noise, with independent ξᵢ ~ N(0, σᵢ²): fᵢ are the free
     responses of the dynamics, σᵢ = gain times half the voltage's range, and of creep so much of it
@@ -85,33 +87,55 @@ class Likelihood:
     Parameters
     ----------
     inputs
-        From the record's first sample on.
-    readings
-        Readings of the displacement and their samples.
+        Those of the record.
+    displacement
+        (samples,), um; nan where a reading is missing.
+    training
+        Slices of the samples that enter the likelihood, in order of time and apart. One discrepancy
+        goes through all of them.
     actuator, noise
-        The model; θ has the actuator's parameters, then the noise's. ``actuator.interval`` is that
-        of the samples.
-    engine
-        Engine; see :mod:`bwbayes.inference.engine`.
+        The model, at the record's own sampling interval and hold; θ has the actuator's parameters,
+        then the noise's.
     from_rest
         The actuator is demagnetized and at rest when the record starts: nothing is unknown, and
         the initial state of θ is the one at zero volts before.
-    half_range
-        Half the range of the voltages that the actuator may have seen, V.
+    name
+        Name of the record.
+    engine
+        Engine; see :mod:`bwbayes.inference.engine`.
     offset_sd
         Prior sd of an offset of the record's own beside that of θ, um; zero if it has none.
+    half_range
+        Half the range of the voltages that sets the size of the unknown start, V; by default of
+        those that the actuator may have seen.
+
+    Raises
+    ------
+    InputError
+        The windows are out of order.
     """
 
     __repr__ = brief
 
     inputs: Inputs
-    readings: Readings
+    displacement: FloatArray
+    training: tuple[slice, ...]
     actuator: Actuator
     noise: Noise
-    engine: Engine
-    from_rest: bool
-    half_range: float
+    from_rest: bool = False
+    name: str = "record"
+    engine: Engine = "numpy"
     offset_sd: float = 0.0
+    half_range: float | None = None
+
+    def __post_init__(self) -> None:
+        edges = [edge for window in self.training for edge in (window.start, window.stop)]
+        if edges != sorted(edges):
+            raise InputError("training: windows must be in order of time and must not overlap")
+
+    def by(self, engine: Engine) -> Likelihood:
+        """Return the likelihood by an engine, its actuator within the range of the voltage."""
+        return replace(self, actuator=self.actuator.within(self.voltage), engine=engine)
 
     @cached_property
     def table(self) -> ParameterTable:
@@ -122,6 +146,29 @@ class Likelihood:
     def voltage(self) -> FloatArray:
         """The voltage (samples,), V."""
         return self.inputs.voltage
+
+    @cached_property
+    def readings(self) -> Readings:
+        """The readings that enter the likelihood."""
+        return Readings.of(self.displacement, self.training)
+
+    @property
+    def span(self) -> Span:
+        """The voltages that the actuator may have seen, V."""
+        return self.actuator.range_of(self.voltage)
+
+    @property
+    def extent(self) -> float:
+        """Range of the readings that enter the likelihood, um."""
+        return float(np.ptp(self.readings.values))
+
+    def is_followed(self, displacement: FloatArray) -> bool:
+        """Tell whether a displacement (readings,), um, misses no more than rounding would.
+
+        Where readings show no noise nothing else is left to learn from what it misses.
+        """
+        values = self.readings.values
+        return float(np.std(values - displacement)) < rounding_sd(values)
 
     @cached_property
     def inputs_read(self) -> Inputs:
@@ -235,8 +282,9 @@ class Likelihood:
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
         column = self.actuator.columns(self.table.actuator(theta))
-        gain = self.actuator.hysteresis.typical_slope(column, self.actuator.range_of(self.voltage))
-        sd = np.repeat((gain * self.half_range)[:, np.newaxis], self.unknowns, axis=1)
+        gain = self.actuator.hysteresis.typical_slope(column, self.span)
+        half_range = self.span.half if self.half_range is None else self.half_range
+        sd = np.repeat((gain * half_range)[:, np.newaxis], self.unknowns, axis=1)
         if (creep := self.actuator.creep) is not None and not self.from_rest:
             sd[:, -len(creep.times) :] *= creep.reach(column)
         if self.offset_sd:

@@ -2,9 +2,9 @@
 
 A :class:`Posterior` gives the log density of a batch of models in the unconstrained coordinates
 in which everything downstream works: the point fit, the sampler, the diagnostics. Its likelihood is
-the sum over its records (:class:`Dataset`), each with its own voltage, windows and start. Each is
-simulated from its first sample; only readings in the training windows enter
-(:mod:`bwbayes.inference.likelihood`). One record is a joint fit of one.
+the sum over those of its records (:class:`Likelihood`), each with its own voltage, windows and
+start. Each is simulated from its first sample; only readings in the training windows enter. One
+record is a joint fit of one.
 """
 
 from __future__ import annotations
@@ -19,104 +19,11 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
-from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, Score, batches
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.inference.readings import Readings
-from bwbayes.inference.state_space import Noise
-from bwbayes.model.actuator import Actuator
-from bwbayes.model.inputs import Inputs, Span
 from bwbayes.shown import brief
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """One record as the likelihood sees it.
-
-    Parameters
-    ----------
-    inputs
-        From the record's first sample on.
-    displacement
-        (samples,), um; nan where a reading is missing.
-    training
-        Slices of the samples that enter the likelihood, in order of time and apart. One discrepancy
-        goes through all of them.
-    actuator, noise
-        The model, at the record's own sampling interval and hold.
-    from_rest
-        The record starts with a demagnetized actuator at rest, and ``initial`` is h at zero volts
-        before. Otherwise the state of the dynamics at the first sample is unknown.
-    name
-        Name of the record.
-
-    Raises
-    ------
-    InputError
-        The windows are out of order.
-    """
-
-    __repr__ = brief
-
-    inputs: Inputs
-    displacement: FloatArray
-    training: tuple[slice, ...]
-    actuator: Actuator
-    noise: Noise
-    from_rest: bool = False
-    name: str = "record"
-
-    def __post_init__(self) -> None:
-        edges = [edge for window in self.training for edge in (window.start, window.stop)]
-        if edges != sorted(edges):
-            raise InputError("training: windows must be in order of time and must not overlap")
-
-    @cached_property
-    def table(self) -> ParameterTable:
-        """The parameters of this record alone."""
-        return ParameterTable(self.actuator, self.noise)
-
-    @property
-    def voltage(self) -> FloatArray:
-        """The voltage (samples,), V."""
-        return self.inputs.voltage
-
-    @cached_property
-    def readings(self) -> Readings:
-        """The readings that enter the likelihood."""
-        return Readings.of(self.displacement, self.training)
-
-    @property
-    def span(self) -> Span:
-        """The voltages that the actuator may have seen, V."""
-        return self.actuator.range_of(self.voltage)
-
-    @property
-    def extent(self) -> float:
-        """Range of the readings that enter the likelihood, um."""
-        return float(np.ptp(self.readings.values))
-
-    def is_followed(self, displacement: FloatArray) -> bool:
-        """Tell whether a displacement (readings,), um, misses no more than rounding would.
-
-        Where readings show no noise nothing else is left to learn from what it misses.
-        """
-        values = self.readings.values
-        return float(np.std(values - displacement)) < rounding_sd(values)
-
-    def likelihood(self, engine: Engine) -> Likelihood:
-        """Return the likelihood of the record."""
-        return Likelihood(
-            self.inputs,
-            self.readings,
-            self.actuator.within(self.voltage),
-            self.noise,
-            engine,
-            self.from_rest,
-            self.span.half,
-        )
 
 
 class RecordView(NamedTuple):
@@ -137,7 +44,7 @@ class Posterior:
     Parameters
     ----------
     datasets
-        The records; at least one.
+        The likelihoods of the records; at least one.
     prior
         Its parameters are those of :attr:`table`, in that order.
     engine
@@ -153,7 +60,7 @@ class Posterior:
 
     __repr__ = brief
 
-    datasets: tuple[Dataset, ...]
+    datasets: tuple[Likelihood, ...]
     prior: JointPrior
     engine: Engine = "numpy"
     joint: ParameterTable | None = None
@@ -170,7 +77,7 @@ class Posterior:
         return self.joint or replace(self.datasets[0].table, records=names)
 
     @property
-    def single_record(self) -> Dataset:
+    def single_record(self) -> Likelihood:
         """The record, of a posterior of one; see :meth:`for_record` for one of several.
 
         Raises
@@ -218,8 +125,8 @@ class Posterior:
 
     @cached_property
     def likelihoods(self) -> tuple[Likelihood, ...]:
-        """The likelihood of each record."""
-        return tuple(dataset.likelihood(self.engine) for dataset in self.datasets)
+        """The likelihood of each record, by the posterior's engine."""
+        return tuple(dataset.by(self.engine) for dataset in self.datasets)
 
     @property
     def likelihood(self) -> Likelihood:

@@ -23,10 +23,11 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import join_ranges, ranges_of
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.inference.parameter_table import Column, ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import OFFSET
 from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
 from bwbayes.model.inputs import Hold, Span
@@ -360,7 +361,7 @@ class Study:
             nothing is free.
         """
         datasets = [
-            Dataset(
+            Likelihood(
                 record.inputs,
                 _readings(record),
                 self.training[name],

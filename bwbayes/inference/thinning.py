@@ -16,7 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inputs import monotone_stretches
 
 # How much a displacement may change, root mean square, in parts of its range: a tenth of the error
@@ -68,7 +69,7 @@ def beginning(posterior: Posterior, samples: int) -> Posterior:
     return posterior.trained(windows) if shorter else posterior
 
 
-def thin(dataset: Dataset, stride: int) -> Dataset:
+def thin(dataset: Likelihood, stride: int) -> Likelihood:
     """Return every ``stride``-th sample of a record, with the extremes of its reversals.
 
     The voltage goes straight from one to the next, whatever it did between the record's samples.
@@ -126,7 +127,7 @@ def _with_reversals(voltage: FloatArray, stride: int) -> FloatArray:
     return result
 
 
-def displacement(posterior: Posterior, dataset: Dataset, theta: FloatArray) -> FloatArray:
+def displacement(posterior: Posterior, dataset: Likelihood, theta: FloatArray) -> FloatArray:
     """Displacement (models, samples), um, from rest at θ (models, parameters) of a record."""
-    likelihood = dataset.likelihood(posterior.engine)
+    likelihood = dataset.by(posterior.engine)
     return likelihood.simulate(likelihood.table.actuator(theta), dataset.inputs)

@@ -19,7 +19,6 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.importance import resample
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.readings import Readings
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Inputs, Span
 from bwbayes.prediction.bands import LeadIn
@@ -111,20 +110,19 @@ def estimate_initial_states(
     memory = training.noise.correlation_time(training.table.noise(theta))
     window = start.window(record, float(np.median(memory)))
     estimate_offset = start.estimate_offset and window is not None
-    readings = Readings.of(np.zeros(1), [slice(0, 1)])
-    if window is not None:
-        assert record.displacement is not None
-        readings = Readings.of(record.displacement, [window])
+    displacement = np.zeros(1) if window is None else record.displacement
+    assert displacement is not None
     likelihood = Likelihood(
         inputs,
-        readings,
+        displacement,
+        (window or slice(0, 1),),
         actuator,
         training.noise,
-        posterior.engine,
         start.from_rest,
-        span.half,
+        engine=posterior.engine,
         # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
-        training.extent if estimate_offset else 0.0,
+        offset_sd=training.extent if estimate_offset else 0.0,
+        half_range=span.half,
     )
     theta, redrawn = _of_new_record(posterior, theta, start, generator)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)

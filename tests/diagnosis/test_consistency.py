@@ -6,8 +6,9 @@ from scipy import stats
 
 from bwbayes.diagnosis.consistency import Consistency, agreements, disagreements
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import noise_model
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
@@ -25,10 +26,8 @@ def pair(seed: int, gain: float = 1.0, noise: float = 0.0) -> Posterior:
         if number:
             reading = gain * reading + noise * np.random.default_rng(seed).standard_normal(400)
         model = noise_model("discrepancy", INTERVAL)
-        windows = (slice(0, 400),)
-        inputs = Inputs(voltage, interval=INTERVAL)
-        one = Dataset(inputs, reading, windows, actuator, model, name=f"r{number}", from_rest=True)
-        datasets.append(one)
+        inputs, windows = Inputs(voltage, interval=INTERVAL), (slice(0, 400),)
+        datasets.append(Likelihood(inputs, reading, windows, actuator, model, True, f"r{number}"))
     return joint(*datasets)
 
 

@@ -6,10 +6,11 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.defaults import ranges_of
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
 from bwbayes.model.inputs import Hold, Inputs
@@ -96,7 +97,7 @@ def posterior_of(
     parameters = parameters_of(ParameterTable(actuator, model).declarations, known, fixed, priors)
     prior = JointPrior(parameters, actuator.hysteresis.holds)
     windows = training or (slice(0, voltage.size),)
-    one = Dataset(inputs, displacement, windows, actuator, model, from_rest)
+    one = Likelihood(inputs, displacement, windows, actuator, model, from_rest)
     return Posterior((one,), prior)
 
 

@@ -229,11 +229,8 @@ def test_draws_have_the_tails() -> None:
 def test_innovations_are_standard_normal(engine: Engine) -> None:
     """3,000 readings of the model: by chance one fails in 1,000 runs; effective ones would."""
     posterior = moving("discrepancy + student", engine)
-    rows = np.arange(3_000)
-    readings = replace(
-        posterior.likelihood.readings, rows=rows, values=np.zeros(3_000), skipped=np.zeros(3_000)
-    )
-    likelihood = replace(posterior.likelihood, readings=readings)
+    windows = (slice(0, 3_000),)
+    likelihood = replace(posterior.likelihood, displacement=np.zeros(3_000), training=windows)
     residual = simulated(3_000, np.array([0.3, 0.8]), np.random.default_rng(4))[np.newaxis]
     theta = np.array([[0.3, DISCREPANCY, TIME, 0.8]])
     innovations = likelihood.innovations(theta, residual)[0]

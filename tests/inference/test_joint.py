@@ -14,10 +14,11 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
 from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender
@@ -28,7 +29,7 @@ ENGINES = get_args(Engine)
 RECORDS = {"loops": (240, 4.0, 100.0, INTERVAL, True), "slow": (150, 1.5, 60.0, 0.025, False)}
 
 
-def dataset(name: str, noise: str = "discrepancy", dynamics: str = "lag") -> Dataset:
+def dataset(name: str, noise: str = "discrepancy", dynamics: str = "lag") -> Likelihood:
     samples, periods, amplitude, interval, from_rest = RECORDS[name]
     actuator = Actuator(dynamics, "first", interval)
     voltage = decaying_sine(samples, periods, amplitude)
@@ -37,11 +38,11 @@ def dataset(name: str, noise: str = "discrepancy", dynamics: str = "lag") -> Dat
     windows = (slice(0, samples // 2), slice(samples // 2 + 10, samples))
     model = noise_model(noise, interval)
     inputs = Inputs(voltage, interval=interval)
-    return Dataset(inputs, displacement, windows, actuator, model, from_rest, name)
+    return Likelihood(inputs, displacement, windows, actuator, model, from_rest, name)
 
 
 def joint(
-    *datasets: Dataset,
+    *datasets: Likelihood,
     per_record: tuple[str, ...] = (),
     shared: tuple[str, ...] = (),
     engine: Engine = "numpy",
@@ -82,7 +83,7 @@ def test_likelihood_is_the_sum_of_the_records_likelihoods(engine: Engine) -> Non
             name if name in both.table.names else f"{name}[{one.name}]" for name in one.table.names
         ]
         columns = [both.table.names.index(name) for name in mine]
-        expected += one.likelihood("numpy").log_density(theta[:, columns])
+        expected += one.by("numpy").log_density(theta[:, columns])
     np.testing.assert_allclose(both.log_likelihood(theta), expected, rtol=1e-9)
 
 
@@ -99,9 +100,9 @@ def test_halves_with_a_discrepancy_are_the_whole() -> None:
     noise = noise_model("discrepancy", INTERVAL)
     windows = slice(0, 900), slice(1100, 2000)
 
-    def half(name: str, *training: slice) -> Dataset:
+    def half(name: str, *training: slice) -> Likelihood:
         inputs = Inputs(voltage, interval=INTERVAL)
-        return Dataset(inputs, reading, training, actuator, noise, True, name)
+        return Likelihood(inputs, reading, training, actuator, noise, True, name)
 
     one = joint(half("whole", *windows))
     halves = [half(f"half-{i}", window) for i, window in enumerate(windows)]

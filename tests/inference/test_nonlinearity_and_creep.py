@@ -57,9 +57,11 @@ def test_a_start_is_integrated_out_however_alike_its_responses_and_small_the_noi
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 1))
     model = likelihood.table.actuator(theta)
     rested = likelihood.actuator.displacement(model, likelihood.voltage)[0]
-    values = rested + likelihood.start_sd(theta)[0] @ responses(likelihood, theta[0])
-    readings = replace(likelihood.readings, values=values)
-    assert_dense(replace(likelihood, readings=readings), theta)
+    displacement = likelihood.displacement.copy()
+    displacement[likelihood.readings.rows] = rested + likelihood.start_sd(theta)[0] @ responses(
+        likelihood, theta[0]
+    )
+    assert_dense(replace(likelihood, displacement=displacement), theta)
 
 
 @pytest.mark.parametrize("parts", PARTS)

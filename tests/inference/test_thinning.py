@@ -6,9 +6,10 @@ from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.mode_finding import Mode, refine
 from bwbayes.inference.noise import noise_model
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.thinning import (
     beginning,
     displacement,
@@ -29,10 +30,10 @@ from tests.inference.problems import (
 )
 
 
-def record_of(voltage: FloatArray) -> Dataset:
+def record_of(voltage: FloatArray) -> Likelihood:
     actuator, noise = Actuator("none", "first", INTERVAL), noise_model("white", INTERVAL)
     inputs = Inputs(voltage, interval=INTERVAL)
-    return Dataset(inputs, np.zeros(voltage.size), (slice(0, voltage.size),), actuator, noise)
+    return Likelihood(inputs, np.zeros(voltage.size), (slice(0, voltage.size),), actuator, noise)
 
 
 @given(

@@ -21,7 +21,6 @@ from bwbayes.errors import InputError
 from bwbayes.inference.compiled.walk import walk
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Distribution
 from bwbayes.model.inputs import Hold, Inputs, Limits, Span
@@ -352,13 +351,14 @@ def test_both_engines_give_the_same_log_density(
     for engine in ("numpy", "numba"):
         likelihood = Likelihood(
             inputs,
-            Readings.of(readings, [slice(20, 580)]),
+            readings,
+            (slice(20, 580),),
             made,
             DiscrepancyNoise(),
-            engine,
             from_rest,
-            SPAN.half,
-            0.0 if from_rest else 3.0,
+            engine=engine,
+            offset_sd=0.0 if from_rest else 3.0,
+            half_range=SPAN.half,
         )
         densities.append(likelihood.start(every))
     for numpy, compiled in zip(*densities, strict=True):

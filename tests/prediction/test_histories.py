@@ -94,6 +94,7 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
             posterior.likelihood,
             from_rest=False,
             offset_sd=50.0,
+            half_range=posterior.single_record.span.half,
             actuator=replace(posterior.single_record.actuator, span=s),
         )
         for s in spans
