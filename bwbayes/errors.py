@@ -16,9 +16,6 @@ from pathlib import PurePath
 from shlex import quote
 from typing import Any, NoReturn
 
-# A longer text, as a stranger's file may cause, shows its beginning and its end.
-LONGEST = 600
-
 
 class ExitStatus(IntEnum):
     """The exit status of a command; commands that build on a run end with that run's."""
@@ -42,8 +39,9 @@ class InputError(ValueError):
 
     def __init__(self, text: str) -> None:
         line = one_line(text)
-        if len(line) > LONGEST:
-            line = f"{line[: LONGEST // 2]} ... {line[-LONGEST // 3 :]}"
+        # A longer text, as a stranger's file may cause, shows its beginning and its end.
+        if len(line) > 600:
+            line = f"{line[:300]} ... {line[-200:]}"
         super().__init__(line)
 
 

@@ -48,7 +48,6 @@ class Quantity:
 VOLTAGE = Quantity("voltage", "V")
 DISPLACEMENT = Quantity("displacement", "um")
 TIME = Quantity("time", "s")
-SAMPLES = Quantity("sample", "samples")
 
 
 # What of the package's texts depends on the quantities. A word may be a part of a path, an option
@@ -98,7 +97,7 @@ class Quantities:
         made = cls(
             VOLTAGE if input is None else Quantity.of(input, "input"),
             DISPLACEMENT if output is None else Quantity.of(output, "output"),
-            TIME if has_clock else SAMPLES,
+            TIME if has_clock else Quantity("sample", "samples"),
         )
         if made.input.name.casefold() == made.output.name.casefold():
             raise InputError(f"output: {made.output.name!r} is the input; give each its own name")

@@ -19,9 +19,6 @@ MOST_LINES, LONGEST = 12, 1200
 # Characters of a line, and of a value in it.
 WIDTH, VALUE = 96, 70
 
-# An array with at most so many numbers is shown by them.
-FEW = 4
-
 
 def brief(instance: object) -> str:
     """Return class and fields of an object, on one line or one each; long values by their size."""
@@ -70,7 +67,7 @@ def _value(value: Any, *, nested: bool = True) -> str:
     """Return a value in a few words; of what is in it, if it is ``nested``."""
     if isinstance(value, np.ndarray):
         text = f"array {value.shape}"
-        if value.size <= FEW:
+        if value.size <= 4:
             text = repr(value.tolist())
         elif value.dtype.kind in "iuf" and np.isfinite(value).any():
             finite = value[np.isfinite(value)]

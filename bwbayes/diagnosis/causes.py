@@ -29,9 +29,6 @@ from bwbayes.record.io.grid import clock
 # A lead-in whose test has a smaller p value than this does not fit.
 LEAD_IN_ALARM = 0.002
 
-# Time constants of a bad start, as fractions of the record, evenly probable.
-DECAYS = (1 / 3, 1 / 10, 1 / 30, 1 / 100)
-
 # Cause of a failing training record without a fitted explanation, unless its cause is outliers.
 UNEXPLAINED = Finding(
     "unknown",
@@ -132,10 +129,12 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     # Add twice the mean: readings of the opposite sign are the mean then.
     log_density, _, _, unexplained["sign"] = weigh(shapes["offset"], residual + 2 * mean)
     nats["sign"] = log_density - plain
-    decays = [weigh(3 * shapes["offset"] * np.exp(-along / decay)) for decay in DECAYS]
+    # Time constants of a bad start, as fractions of the record, evenly probable.
+    constants = (1 / 3, 1 / 10, 1 / 30, 1 / 100)
+    decays = [weigh(3 * shapes["offset"] * np.exp(-along / decay)) for decay in constants]
     starts = [fit[0] for fit in decays]
     unexplained["start"] = decays[int(np.argmax(starts))][-1]
-    nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
+    nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(constants)) - plain
     nats["outliers"] = tail_nats(white)
     outlying = np.abs(white) > 5 * max(scatter(white), 1.0)
     unexplained["outliers"] = float(np.mean(np.where(outlying, 0.0, residual) ** 2))
@@ -160,7 +159,7 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     square = float(np.mean(white**2))
     nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
     unexplained["noise"] = missed / square
-    settled = time[0] + 3 * DECAYS[int(np.argmax(starts))] * float(np.ptp(time))
+    settled = time[0] + 3 * constants[int(np.argmax(starts))] * float(np.ptp(time))
     words = {
         "name": bands.name,
         "settled": clock(settled, interval),

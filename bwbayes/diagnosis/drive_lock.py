@@ -30,9 +30,6 @@ ALARM, MATTERS = 0.02, 0.1
 # Number of the nearest states of the drive to compare a residual with, and of the readings used.
 NEIGHBORS, READINGS = 4, 1_500
 
-# Times over which the voltage is averaged, in parts of the time between reversals.
-AVERAGES = (0.2, 0.6)
-
 # Number of residuals to draw, and of draws whose mean is the model's displacement.
 DRAWN, MEAN_OF = 200, 40
 
@@ -161,7 +158,8 @@ def like_states(voltage: FloatArray, rows: IntArray, turn_time: float) -> IntArr
     """
     sums = np.concatenate([[0.0], np.cumsum(voltage)])
     columns = [voltage[rows]]
-    for block in AVERAGES:
+    # Times over which the voltage is averaged, in parts of the time between reversals.
+    for block in (0.2, 0.6):
         first = np.maximum(rows + 1 - max(round(block * turn_time), 1), 0)
         columns.append((sums[rows + 1] - sums[first]) / (rows + 1 - first))
     turns = np.concatenate([[0], turning_points(voltage)])

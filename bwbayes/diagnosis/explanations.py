@@ -41,9 +41,6 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.smooth,
 )
 
-# Functions for records with a clock only, besides stages that depend on time.
-TIMED = (model.growing_noise, model.creep, model.dynamics, model.hold, model.smooth)
-
 # On a good record a ratio of evidences exceeds k with a probability of at most 1/k (Markov's
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
 LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
@@ -77,7 +74,9 @@ def explain(
     # With several records, the model of the actuator is a matter of all of them.
     kinds = (*ADDITIONS, *(CHANGES if scene.alone else (LONG_DELAY.explanations,)))
     if not scene.posterior.single_record.inputs.quantities.has_clock:
-        kinds = tuple(kind for kind in kinds if kind not in TIMED)
+        # Besides stages that depend on time.
+        timed = (model.growing_noise, model.creep, model.dynamics, model.hold, model.smooth)
+        kinds = tuple(kind for kind in kinds if kind not in timed)
     for number, kind in enumerate(kinds):
         if is_over():
             break

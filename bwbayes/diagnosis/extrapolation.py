@@ -31,10 +31,6 @@ PART = 0.1
 # half a decade is half of the usual model error of one or two percent.
 LONGER = 3.0
 
-# Mean distance of a drive's voltages and last reversals from those of training, in parts of the
-# range: it is at most 0.02 for similar drives, and at least 0.03 for others.
-ALIKE = 0.025
-
 
 @dataclass(frozen=True)
 class Drive:
@@ -131,7 +127,8 @@ def beyond_training(
         )
         findings.append(Finding("speed", text, "train on a record that is as fast"))
     distance = _distance(posterior, (low, high), voltage, window)
-    if distance > ALIKE:
+    # It is at most 0.02 for similar drives, and at least 0.03 for others.
+    if distance > 0.025:
         text = (
             f"voltage and last reversal are {100 * distance:.2g}% of the range away from those of "
             "training on average; the bands' level is untested on these loops"
@@ -151,13 +148,10 @@ def beyond_training(
     return findings
 
 
-# Excitations that the training record lacks, by the kind of the finding.
-UNEXCITED = {"speed": "fast edges", "slow": "slow holds"}
-
-
 def unexcited(findings: Iterable[Finding]) -> str:
     """Name a drive's excitations that the training record lacks; return "" without any."""
-    kinds = [UNEXCITED[finding.kind] for finding in findings if finding.kind in UNEXCITED]
+    names = {"speed": "fast edges", "slow": "slow holds"}
+    kinds = [names[finding.kind] for finding in findings if finding.kind in names]
     return f"this drive excites what the record did not ({', '.join(kinds)})" if kinds else ""
 
 

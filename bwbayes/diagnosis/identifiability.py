@@ -36,9 +36,8 @@ from bwbayes.model.inputs import monotone_stretches, turning_points
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
 
-# The discrepancy that every fit leaves, as a part of the range, and its description.
+# The discrepancy that every fit leaves, as a part of the range.
 USUAL_ERROR = 0.01
-IF_OFF = f"if the model is off by {USUAL_ERROR:.0%} of the range"
 
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 1 / 3
@@ -72,7 +71,10 @@ def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
     elif swings.size < 2 or swings.min() > 0.8 * swings.max():
         advice = "vary the amplitude: let it decay to a tenth over ten periods"
     for i in range(min(count, 2)):
-        text = f"{combined(directions[:, i], names)}: {remaining(parts[i])} {IF_OFF}"
+        text = (
+            f"{combined(directions[:, i], names)}: {remaining(parts[i])} if the model is off by "
+            f"{USUAL_ERROR:.0%} of the range"
+        )
         if i == count - 1 < parts.size - 1:
             text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
         elif i == 1:

@@ -28,10 +28,6 @@ from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.model.spec import ModelSpec
 
-# Prior of an exponent that is not 1: in nearly all published fits it lies below 5.
-EXPONENT = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
-EXPONENT_STARTS = ({"exponent": -1.0}, {"exponent": 1.0})
-
 # A history that an operator's unknown start does not hold.
 DEMAGNETIZED = "demagnetized, and then driven straight from 0 V to the record's first voltage"
 
@@ -71,7 +67,10 @@ def exponent(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try another exponent of the hysteresis's transition, if that is fixed at 1."""
     fixed = {parameter.name: parameter.fixed for parameter in scene.posterior.prior.parameters}
     if fixed.get("exponent") == 1.0:
-        sighting = Sighting({"exponent": Stated(EXPONENT)}, EXPONENT_STARTS)
+        # In nearly all published fits it lies below 5.
+        prior = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
+        starts = ({"exponent": -1.0}, {"exponent": 1.0})
+        sighting = Sighting({"exponent": Stated(prior)}, starts)
         yield from scene.changed("free exponent", _exponent_words, sighting=sighting)
 
 

@@ -28,9 +28,6 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched, watched
 
-# Largest RMSE of a rival, relative to the best of them.
-MISSES = 3.0
-
 # Number of draws of each model, whose mean is its prediction.
 DRAWS = 40
 
@@ -115,7 +112,7 @@ def fit_rivals(
 
 def close_rivals(rivals: Sequence[Rival], rmse: float) -> list[Rival]:
     """Return rivals that fit about as well as the best of them, or as a model of this RMSE."""
-    limit = MISSES * min([rmse, *(rival.rmse for rival in rivals)])
+    limit = 3.0 * min([rmse, *(rival.rmse for rival in rivals)])
     return [rival for rival in rivals if rival.rmse <= limit]
 
 

@@ -40,10 +40,6 @@ if TYPE_CHECKING:
 STEPS, STRETCH = 0.85 * np.arange(-17, 7), 0.1
 
 
-# Φ(1), what one sd of a normal distribution is above; to compute it loads a library.
-ONE_SD = 0.8413447460685429
-
-
 class Followed(NamedTuple):
     """The result of a filter along readings.
 
@@ -78,7 +74,8 @@ def scale_mixture(inverse_df: FloatArray) -> tuple[FloatArray, FloatArray]:
 def scale_of(inverse_df: FloatArray) -> FloatArray:
     """Return s (models,), at 1/ν (models,), where ±1 holds as much as ±1 sd of a normal one."""
     # By its series where the quantile is that of a normal distribution to rounding.
-    exact = 1 / scipy.special.stdtrit(1 / np.maximum(inverse_df, 1e-6), ONE_SD)
+    one_sd = 0.8413447460685429  # Φ(1), which a library would have to be loaded for
+    exact = 1 / scipy.special.stdtrit(1 / np.maximum(inverse_df, 1e-6), one_sd)
     return np.where(inverse_df > 1e-6, exact, 1 - inverse_df / 2)
 
 

@@ -35,9 +35,6 @@ DRAWS, STARTS = 128, 5
 # an ensemble that starts there stays for hundreds of steps.
 NEGLIGIBLE = 30.0
 
-# Part of the sum of squares that least squares leaves where a climb goes on from it.
-NEARBY = 1e-4
-
 # Samples of a record in which modes are looked for, and prior draws that tell whether a longer one
 # can be thinned to so many.
 SAMPLES, PROBES = 20_000, 8
@@ -130,7 +127,8 @@ def local_minima(
         As :func:`fit`.
     """
     posterior = beginning(posterior, SAMPLES)
-    return np.stack(_places(posterior, generator, starts, watch, tolerance=NEARBY)[0])
+    # A climb goes on from where least squares leaves this part of the sum of squares.
+    return np.stack(_places(posterior, generator, starts, watch, tolerance=1e-4)[0])
 
 
 def mode_weights(posterior: Posterior, point: MAPEstimate) -> tuple[FloatArray, FloatArray]:

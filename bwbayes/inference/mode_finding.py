@@ -22,9 +22,6 @@ from bwbayes.watching import Watch, unwatched, watched
 # A round that gains less, nats, is the last one; and rounds at most.
 GAIN, ROUNDS = 0.05, 20
 
-# Steps in the noise's coordinates a round.
-NOISE_STEPS = 6
-
 # Rounds from every start, and how many times what a round gained all later ones may gain.
 FIRST_ROUNDS, AHEAD = 2, 10.0
 
@@ -198,7 +195,7 @@ class Target:
             log_determinant -= float(np.sum(np.log(values)))
         return covariance, log_determinant
 
-    def step_noise(self, states: Sequence[Iterate], count: int = NOISE_STEPS) -> list[Iterate]:
+    def step_noise(self, states: Sequence[Iterate], count: int = 6) -> list[Iterate]:
         """Step in the noise's coordinates from states side by side.
 
         By Newton's method where the density bends down.

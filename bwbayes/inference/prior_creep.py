@@ -32,9 +32,6 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inputs import Span, time_between_turns
 from bwbayes.model.linear import Creep, creep_times
 
-# Steps to the mode.
-ROUNDS = 4
-
 
 def add_prior_creep(
     posterior: Posterior, draws: FloatArray, duration: float, generator: np.random.Generator
@@ -71,7 +68,7 @@ def add_prior_creep(
     begin = places.mean(axis=0)
     begin[strengths] = 0.0  # the mean of the prior: without any creep its start is another one
     mode, hessian = begin.copy(), prior
-    for _ in range(ROUNDS):
+    for _ in range(4):  # steps to the mode
         linear = target.linearize(mode[np.newaxis])
         hessian = linear.fisher_information[0] + prior
         mode[moving] += np.linalg.solve(hessian, linear.gradient[0] - prior @ mode[moving])

@@ -35,9 +35,6 @@ from bwbayes.model.declaration import Declaration
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
-# Readings that a settled filter takes at once.
-BLOCK = 64
-
 
 class Filtered(NamedTuple):
     """Innovations of series, and what is known of the discrepancy after the last reading.
@@ -495,7 +492,7 @@ def _filter_settled(
     state expected after all readings, (models, series, states), and the innovations, um.
     """
     models, n_series, readings = series.shape
-    size = min(BLOCK, readings)
+    size = min(64, readings)  # that are taken at once
     n_blocks = readings // size
     forced = (transitions @ gain[..., np.newaxis])[..., 0]
     onwards = transitions - forced[..., np.newaxis] * observe

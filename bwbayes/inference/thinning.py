@@ -20,23 +20,20 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inputs import monotone_stretches
 
-# How much a displacement may change, root mean square, in parts of its range: a tenth of the error
-# of a Bouc-Wen model.
-ERROR = 1e-3
-
 
 def thin_posterior(posterior: Posterior, theta: FloatArray, samples: int) -> Posterior:
     """Thin each record of a posterior to so many samples, or as few as its displacement allows.
 
-    That of most models at θ (models, parameters) changes by no more than :data:`ERROR`. A posterior
-    of short records is returned as it is.
+    That of most models at θ (models, parameters) changes by no more than a thousandth of its range,
+    root mean square: a tenth of the error of a Bouc-Wen model. A posterior of short records is
+    returned as it is.
     """
     for dataset in posterior.datasets:
         models = posterior.table.of(theta, dataset.name)
         stride = dataset.readings.samples // samples
         if stride > 1:
             full_displacement = displacement(posterior, dataset, models)
-            limit = ERROR * np.ptp(full_displacement, axis=1)
+            limit = 1e-3 * np.ptp(full_displacement, axis=1)
         while stride > 1:
             short, kept = thin(dataset, stride), np.sum(dataset.readings.rows % stride == 0)
             change = displacement(posterior, short, models) - full_displacement[:, ::stride]

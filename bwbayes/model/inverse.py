@@ -39,9 +39,6 @@ from bwbayes.model.stage import undo_stages
 
 Curve = Callable[[FloatArray], FloatArray]
 
-# Samples that are searched for together; operators that integrate follow as many.
-LONGEST = 2048
-
 
 def inverse(
     actuator: Actuator,
@@ -221,7 +218,8 @@ class _Single:
         reach = within.rate * self.actuator.interval
         result, free, behind = [] if self.from_rest else [np.array([start])], self.from_rest, False
         joined = np.concatenate([here, drive if self.from_rest else drive[1:]])
-        for begin, last, _ in monotone_stretches(joined, LONGEST):
+        # So many samples are searched for together; operators that integrate follow as many.
+        for begin, last, _ in monotone_stretches(joined, 2048):
             first = begin
             while first < last:
                 # Behind the drive, go on sample by sample until it is caught up with.

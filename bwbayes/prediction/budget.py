@@ -42,9 +42,6 @@ TYPES: Mapping[str, str] = {
     **dict.fromkeys((SENSOR, AMPLIFIER, CURVE, PRIOR, CREEP), "B"),
 }
 
-# Relative step in an sd of the noise.
-STEP = 1e-3
-
 
 class Measurand(NamedTuple):
     """A quantity as the readings have it: ``values`` (draws,) in a ``unit`` of um and V.
@@ -165,14 +162,15 @@ def _information(target: Target, place: FloatArray) -> dict[str, FloatArray]:
         if parameter.name in physical or parameter.unit != "um":
             continue
         steps = np.repeat(theta, 2, axis=0)
-        steps[:, column] *= 1 + STEP * np.array([1.0, -1.0])
+        relative = 1e-3
+        steps[:, column] *= 1 + relative * np.array([1.0, -1.0])
         informations = posterior.score(
             steps,
             np.repeat(linear.slopes, 2, axis=0),
             np.repeat(readings - linear.residual, 2, axis=0),
         ).fisher_information
         source = NOISE if parameter.plain == "sensor_sd" else MODEL
-        parts[source] -= (informations[0] - informations[1]) / (4 * STEP)
+        parts[source] -= (informations[0] - informations[1]) / (4 * relative)
     parts[STATE] = linear.fisher_information[0] - parts[NOISE] - parts[MODEL]
     return parts
 

@@ -24,8 +24,6 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.prediction.bands import Bands, Correction
 
-LEAST_BLOCKS = 20
-
 
 def correct(bands: Bands) -> Correction:
     """Return the correction of a 95% sensor band from its readings after ``scored_from``."""
@@ -40,8 +38,9 @@ def correct(bands: Bands) -> Correction:
     length = math.ceil(residual_memory(residual / np.maximum(bands.sd("sensor"), 1e-150), scored))
     blocks = _blocks(bands, scored, length)
     block_s = length * bands.interval
-    if len(blocks) < LEAST_BLOCKS:
-        return Correction(None, len(blocks), block_s, LEAST_BLOCKS * block_s)
+    least = 20
+    if len(blocks) < least:
+        return Correction(None, len(blocks), block_s, least * block_s)
     share = np.concatenate([np.full(rows.size, 1 / rows.size) for rows in blocks])
     reached = factors[np.concatenate(blocks)]
     order = np.argsort(reached)

@@ -25,10 +25,6 @@ from bwbayes.watching import Watch, part, parts, unwatched, watched
 FEW = 50
 
 
-# Nodes of the grid of hysteretic states.
-NODES = 17
-
-
 @dataclass(frozen=True)
 class Histories:
     """A record's likelihood for each history, and ``which`` of them each draw has, (draws,)."""
@@ -241,14 +237,14 @@ def _grid(
     evidence (draws,) for the history.
     """
     draws = len(states.theta)
-    low, high = np.zeros(draws), np.ones(draws)
+    low, high, size = np.zeros(draws), np.ones(draws), 17
     if not states.open:
-        nodes = np.zeros((NODES, draws))
+        nodes = np.zeros((size, draws))
         return nodes, nodes, np.nan_to_num(likelihood.log_density(states.at(low)), nan=-np.inf)
     for _ in watched(range(6), watch):
-        nodes = np.linspace(low, high, NODES)
+        nodes = np.linspace(low, high, size)
         theta = np.concatenate([states.at(quantile) for quantile in nodes])
-        density = likelihood.log_density(theta).reshape(NODES, draws)
+        density = likelihood.log_density(theta).reshape(size, draws)
         density = np.nan_to_num(density, nan=-np.inf, posinf=-np.inf)
         best = np.max(density, axis=0)
         density = np.maximum(density - best, -1e3)
@@ -257,7 +253,7 @@ def _grid(
             break
         possible = density > -10.0
         first = np.maximum(np.argmax(possible, axis=0) - 1, 0)
-        last = NODES - 1 - np.maximum(np.argmax(possible[::-1], axis=0) - 1, 0)
+        last = size - 1 - np.maximum(np.argmax(possible[::-1], axis=0) - 1, 0)
         low, high = (nodes[edge, np.arange(draws)] for edge in (first, last))
     return nodes, density, best + np.log(np.sum(_cells(nodes, density)[1], axis=0))
 

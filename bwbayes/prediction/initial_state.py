@@ -28,9 +28,6 @@ from bwbayes.record.record import Record
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched
 
-# Turns in which the unknowns of a start are chosen.
-SWEEPS = 4
-
 
 @dataclass(frozen=True)
 class InitialStates:
@@ -144,7 +141,7 @@ def estimate_initial_states(
         likelihoods, theta, generator, part(watch, 0.0, 0.5)
     )
     # The stages' unknown parameters and the histories are chosen in turns.
-    for _ in range(SWEEPS if redrawn else 0):
+    for _ in range(4 if redrawn else 0):
         theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
         histories, start_theta, evidence = choose_histories(likelihoods, theta, generator)
     rows = resample(evidence, generator)

@@ -41,10 +41,6 @@ from bwbayes.watching import Watch, counted, part, unwatched
 # Posterior draws in the mixture.
 DRAWS = 1000
 
-# Samples that are simulated and summarized at once: few enough for a core's own cache. The number
-# is no power of two: rows of draws that far apart would take each other's place in it.
-PIECE = 400
-
 # Share of a prediction's time that goes into the states that it starts from, about.
 STATES_SHARE = 0.4
 
@@ -294,7 +290,9 @@ def _bands(
 
     begin, threads = 0, 2  # that summarize pieces, while this one simulates the next
     with ThreadPoolExecutor(threads) as executor:
-        for simulated in start.pieces(record.inputs[: window.stop], PIECE):
+        # A piece is small enough for a core's own cache, and no power of two: rows of draws that
+        # far apart would take each other's place in it.
+        for simulated in start.pieces(record.inputs[: window.stop], 400):
             first, end = max(begin, window.start), begin + simulated.shape[1]
             more(min(first, end) - begin)
             begin = end

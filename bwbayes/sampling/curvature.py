@@ -31,9 +31,6 @@ from bwbayes.sampling.secant import SecantMap
 LONGEST = 12  # only the longest coordinates bend others
 FARTHEST = 5.0  # sds beyond which a bend continues straight: no draws show it there
 
-# Sds whose squares add up, by name.
-SDS = SENSOR_SD.name, DISCREPANCY_SD.name
-
 
 @dataclass(frozen=True)
 class QuadraticMap:
@@ -267,7 +264,8 @@ class TotalRatioMap:
         }
         pairs, powers = [], []
         for record in dict.fromkeys(record for _, record in forms):
-            for names, power in ((SDS, 2.0), (TIME_CONSTANTS, 1.0)):
+            sds = SENSOR_SD.name, DISCREPANCY_SD.name  # their squares add up
+            for names, power in ((sds, 2.0), (TIME_CONSTANTS, 1.0)):
                 pair = [forms[name, record] for name in names if (name, record) in forms][:2]
                 if len(pair) == 2:
                     pairs.append(pair)

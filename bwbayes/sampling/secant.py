@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 # Parameters that the displacement of every operator with a gain is linear in.
 LINEAR = "d", "offset"
 
-# To so many samples a long record is thinned.
-SAMPLES = 10_000
-
 
 @dataclass(frozen=True)
 class SecantMap:
@@ -165,7 +162,7 @@ class SecantMap:
     def _thinned(self) -> Posterior:
         """The posterior whose displacement tells slope and level."""
         at_reference = self._prior.theta(self._center[np.newaxis])
-        return thin_posterior(self._known, at_reference, SAMPLES)
+        return thin_posterior(self._known, at_reference, samples=10_000)
 
     def _displacement(self, free: FloatArray) -> FloatArray:
         return self._thinned.displacement(self._prior.theta(free), np.zeros(len(free)))
