@@ -74,9 +74,12 @@ class Stage(ABC):
         """Say what it does with these values of its parameters, in a phrase."""
         return self.name
 
-    @abstractmethod
-    def numbers(self, column: Values, timing: Timing) -> FloatArray:
-        """Return what ``move`` needs to know of models, (models, any), from columns (models,)."""
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002
+        """Return what ``move`` needs to know of models, (models, any), from columns (models,).
+
+        By default the parameters in their order.
+        """
+        return np.stack([column[declared.name] for declared in self.parameters], axis=1)
 
     def numbers_at(self, column: Values, timing: Timing, inputs: Inputs) -> FloatArray:
         """Return the same with what the stage sees at the first of inputs, if it sees any."""

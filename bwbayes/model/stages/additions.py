@@ -25,21 +25,12 @@ def _size(name: str, unit: str, label: str, description: str, fraction: float) -
     return Declaration(name, unit, label, description, default, scope="event", at_rest=0.0)
 
 
-class _Addition(Stage):
-    """Something that is added at every time."""
-
-    side: ClassVar[Side] = "output"
-    sees: ClassVar = "time"
-
-    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002  # no pace
-        """Return the parameters, (models, any)."""
-        return np.stack([column[declared.name] for declared in self.parameters], axis=1)
-
-
-class Drift(_Addition):
+class Drift(Stage):
     """Drift of the sensor or its mount: y = x + v t + a t², of displacement x, um."""
 
     name: ClassVar = "drift"
+    side: ClassVar[Side] = "output"
+    sees: ClassVar = "time"
     advice: ClassVar = "measure again after a longer warm-up"
     parameters: tuple[Declaration, ...] = (
         _size("drift", "um/s", "v_d", "drift of the readings", 0.1),
@@ -61,10 +52,12 @@ class Drift(_Addition):
         return value - parameters[2] * (parameters[0] + parameters[1] * parameters[2])
 
 
-class Transient(_Addition):
+class Transient(Stage):
     """Transient after a switch-on at t₀: y = x + A exp(−(t − t₀)/τ), of displacement x, um."""
 
     name: ClassVar = "transient"
+    side: ClassVar[Side] = "output"
+    sees: ClassVar = "time"
     starts: ClassVar = tuple({"transient_time": z} for z in (-1.2, 0.0, 1.2))
     advice: ClassVar = "wait until everything has settled"
     parameters: tuple[Declaration, ...] = (
@@ -106,10 +99,12 @@ class Transient(_Addition):
         return value - parameters[0] * np.exp(-after_switch / parameters[1])
 
 
-class OffsetStep(_Addition):
+class OffsetStep(Stage):
     """Step of the mount or the sensor: y = x + A from the time t₁ on, of displacement x, um."""
 
     name: ClassVar = "step"
+    side: ClassVar[Side] = "output"
+    sees: ClassVar = "time"
     advice: ClassVar = "fit one side of the step"
     parameters: tuple[Declaration, ...] = (
         _size("step", "um", "A_1", "step of the readings", 0.1),
@@ -141,10 +136,12 @@ class OffsetStep(_Addition):
         return value - select(parameters[2] >= parameters[1], parameters[0], 0.0)
 
 
-class Oscillation(_Addition):
+class Oscillation(Stage):
     """Oscillation, as of the mains: y = x + A sin 2πft + B cos 2πft, of displacement x, um."""
 
     name: ClassVar = "oscillation"
+    side: ClassVar[Side] = "output"
+    sees: ClassVar = "time"
     advice: ClassVar = "look for the source: mains, ground loops, vibration"
     parameters: tuple[Declaration, ...] = (
         _size("oscillation_sine", "um", "A_s", "oscillation in the readings, its sine", 0.01),

@@ -50,10 +50,6 @@ class Temperature(Stage):
         percent, reference = 100 * values["temperature_gain"], values["temperature_reference"]
         return f"displacement that changes by {percent:+.2g}% per K from {reference:.3g} degC on"
 
-    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002  # no pace
-        """Return c and T₀, (models, 2)."""
-        return np.stack([column["temperature_gain"], column["temperature_reference"]], axis=1)
-
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
         """Return y."""
@@ -88,10 +84,6 @@ class MovingGain(Stage):
     def describe(self, values: Mapping[str, float]) -> str:
         """Say how much it is in a minute."""
         return f"gain that changes by {6000 * values['gain_drift']:+.2g}% a minute"
-
-    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002  # no pace
-        """Return g, (models, 1)."""
-        return column["gain_drift"][:, np.newaxis]
 
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004

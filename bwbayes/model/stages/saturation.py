@@ -7,9 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal, normal
-from bwbayes.model.stage import Side, Stage, Timing
+from bwbayes.model.declaration import Declaration, lognormal, normal
+from bwbayes.model.stage import Side, Stage
 
 
 class Saturation(Stage):
@@ -44,10 +43,6 @@ class Saturation(Stage):
         middle, reach = values["saturation_middle"], values["saturation_reach"]
         ends = f"{middle - reach:.3g} and {middle + reach:.3g} V"
         return f"amplifier that saturates towards {ends}"
-
-    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002  # no pace
-        """Return c and r, (models, 2), V."""
-        return np.stack([column["saturation_middle"], column["saturation_reach"]], axis=1)
 
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004

@@ -7,9 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, normal
-from bwbayes.model.stage import Side, Stage, Timing
+from bwbayes.model.declaration import Declaration, normal
+from bwbayes.model.stage import Side, Stage
 
 
 class SensorCurve(Stage):
@@ -58,11 +57,6 @@ class SensorCurve(Stage):
         s = np.linspace(-1.0, 1.0, 201)
         bent = values["sensor_quadratic"] * (s**2 - 1) + values["sensor_cubic"] * s * (s**2 - 1)
         return f"sensor with a curve, off its chord by {50 * np.abs(bent).max():.2g}% of the range"
-
-    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002  # no pace
-        """Return a, b, m and Y, (models, 4)."""
-        names = ("sensor_quadratic", "sensor_cubic", "sensor_middle", "sensor_half")
-        return np.stack([column[name] for name in names], axis=1)
 
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
