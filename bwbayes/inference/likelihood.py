@@ -1,5 +1,8 @@
 """The likelihood of one record: forward model and noise, and what is unknown of its start.
 
+The model is simulated along every voltage sample; only some samples have a reading that counts:
+those inside the training windows that are not missing (:class:`Readings`).
+
 A record that starts in the middle of a drive finds the dynamics in motion: the displacement is not
 where the drive would hold it. How far off it is, and how fast it moves, adds a free response that
 dies out with the dynamics' own times. It enters the displacement linearly, and so does an offset
@@ -9,7 +12,7 @@ of the record's own. Given the other parameters all of these are jointly normal,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -23,11 +26,71 @@ from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.heavy_tails import Followed
 from bwbayes.inference.parameter_table import ParameterTable
-from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs, Span, rate
 from bwbayes.shown import brief
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of a record, in order of time.
+
+    Parameters
+    ----------
+    rows
+        (readings,) the sample of each.
+    values
+        (readings,), um.
+    stride
+        Samples from one reading to the next, where none is missing.
+    skipped
+        (readings,) readings that are missing just before each one: how much farther than ``stride``
+        it is from the one before, in strides.
+    """
+
+    __repr__ = brief
+
+    rows: IntArray
+    values: FloatArray
+    stride: int
+    skipped: FloatArray
+
+    @classmethod
+    def of(cls, displacement: FloatArray, windows: Sequence[slice]) -> Readings:
+        """Take the readings in windows (slices) of a displacement (samples,); nan marks a gap.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        rows = np.concatenate([np.arange(w.start, w.stop) for w in windows]).astype(np.int64)
+        rows = rows[np.isfinite(displacement[rows])]
+        if not rows.size:
+            raise InputError("record.train: it holds no reading; give another window")
+        gaps = np.diff(rows)
+        stride = int(gaps.min()) if gaps.size else 1
+        skipped = np.concatenate([[0.0], (gaps - stride) / stride])
+        return cls(rows, displacement[rows], stride, skipped)
+
+    @cached_property
+    def gaps(self) -> tuple[FloatArray, IntArray]:
+        """Numbers of missing readings (kinds,), 0 first, and which is before each (readings,)."""
+        numbers, which = np.unique(np.append(self.skipped, 0.0), return_inverse=True)
+        return numbers, which[:-1]
+
+    @property
+    def samples(self) -> int:
+        """Samples of the record up to the last reading."""
+        return int(self.rows[-1]) + 1
+
+    @property
+    def where(self) -> slice | IntArray:
+        """The rows as an index: a slice, which copies nothing, if no reading is missing."""
+        if self.skipped.any():
+            return self.rows
+        return slice(int(self.rows[0]), self.samples, self.stride)
 
 
 def batches(models: int, samples: int, elements: int = 1 << 23) -> Iterator[slice]:

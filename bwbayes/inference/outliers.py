@@ -22,8 +22,8 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.likelihood import Readings
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.readings import Readings
 from bwbayes.model.inputs import rate
 
 # Standard deviations from what its neighbors predict at which a reading is an outlier.

@@ -204,7 +204,7 @@ class Noise(ABC):
         """Turn series (models, series, readings) of each model into independent innovations.
 
         ``skipped`` (readings,) counts the readings that are missing just before each one, by
-        default none, as in :class:`~bwbayes.inference.readings.Readings`. Returns the innovations
+        default none, as in :class:`~bwbayes.inference.likelihood.Readings`. Returns the innovations
         over their sds, shaped as the series, and the log determinant (models,) of the covariance:
         with V = L Lᵀ these are L⁻¹ series and log det V.
         """

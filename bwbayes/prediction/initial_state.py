@@ -5,6 +5,16 @@ the dynamics are moving then, and its sensor's offset. Each posterior draw gets 
 readings of a lead-in, which is not judged later, choose them: offset and dynamics enter linearly
 and are integrated out exactly; the hysteretic state comes from :mod:`bwbayes.prediction.histories`.
 Whether the lead-in fits the model at all is tested.
+
+Where the readings end, a part of the model discrepancy is known, too: by the filter of the noise
+its state (:meth:`~bwbayes.inference.state_space.Noise.transition`) has the mean m and the
+covariance P, given a draw. A process whose stationary covariance is P₀ goes on from there: a time t
+later it is normal with
+
+    mean F(t) m,   covariance P₀ − F(t) (P₀ − P) F(t)ᵀ.
+
+So a forecast is narrower than any other prediction at first, and after a few correlation times as
+wide as ever.
 """
 
 from __future__ import annotations
@@ -16,17 +26,71 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.importance import resample
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.state_space import Noise
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Inputs, Span
 from bwbayes.prediction.bands import LeadIn
-from bwbayes.prediction.discrepancy_state import DiscrepancyState, filter_discrepancy
 from bwbayes.prediction.histories import Histories, choose_histories, uniform
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
-from bwbayes.watching import Watch, part, unwatched
+from bwbayes.watching import Watch, part, unwatched, watched
+
+
+@dataclass(frozen=True)
+class DiscrepancyState:
+    """The discrepancy's state after the last reading, for each draw.
+
+    ``last`` is the sample of the last reading; ``mean`` (draws, states) that of the states there,
+    and ``gained`` (draws, states, states) by how much their covariance is less than the stationary
+    one; ``noise`` is that for the interval between samples, and ``parameters`` (draws, parameters)
+    are its own.
+    """
+
+    last: int
+    mean: FloatArray
+    gained: FloatArray
+    noise: Noise
+    parameters: FloatArray
+
+    def after(self, first: int, samples: int) -> tuple[FloatArray, FloatArray]:
+        """Return what is known of samples from one on, each (draws, samples).
+
+        The discrepancy's mean, um, and the part of its variance that is known; before the last
+        reading those there.
+        """
+        later = np.maximum(first + np.arange(samples) - self.last, 0).astype(np.float64)
+        row = self.noise.observe @ self.noise.transition(self.parameters, later)
+        known_variance = np.einsum("dtj,djk,dtk->dt", row, self.gained, row)
+        always = self.noise.marginal_sd(self.parameters)[0][:, np.newaxis] ** 2
+        share = np.divide(
+            known_variance, always, out=np.zeros_like(known_variance), where=always > 0
+        )
+        return np.einsum("dtj,dj->dt", row, self.mean), np.minimum(share, 1.0)
+
+
+def filter_discrepancy(
+    likelihood: Likelihood, theta: FloatArray, simulated: FloatArray, watch: Watch = unwatched
+) -> DiscrepancyState:
+    """Return what the readings of a record leave at θ (draws, parameters).
+
+    ``simulated`` (draws, readings), um, is the model's displacement at the readings. ``watch`` is
+    called with the share that is done.
+    """
+    readings, noise = likelihood.readings, likelihood.spaced
+    parameters = likelihood.table.noise(theta)
+    mean, covariance = [], []
+    # Some draws at a time: what is kept of all readings of all would not fit into memory.
+    for rows in watched(np.array_split(np.arange(len(theta)), -(-len(theta) // 50)), watch):
+        residual = (readings.values - simulated[rows])[:, np.newaxis]
+        sensor = likelihood.sensor(parameters[rows])
+        filtered = noise.filter(parameters[rows], residual, readings.skipped, sensor)
+        mean.append(filtered.mean[:, 0])
+        covariance.append(filtered.covariance)
+    gained = noise.stationary(parameters) - np.concatenate(covariance)
+    last = int(readings.rows[-1])
+    return DiscrepancyState(last, np.concatenate(mean), gained, likelihood.noise, parameters)
 
 
 @dataclass(frozen=True)
@@ -350,3 +414,36 @@ def _normal(mean: FloatArray, covariance: FloatArray, generator: np.random.Gener
     spread = np.sqrt(np.maximum(values, 0.0)) * score
     drawn: FloatArray = mean + np.einsum("mij,mj->mi", vectors, spread)
     return drawn
+
+
+# Draws that are left at least, in effect.
+MIN_EFFECTIVE = 100
+
+
+def resample(evidence: FloatArray, generator: np.random.Generator) -> IntArray:
+    """Choose as many draws by their log evidence (draws,), some several times; return their rows.
+
+    Evidence may single out a few draws: then it counts by a power below one, with which the weights
+    w leave (Σ w)² / Σ w² = :data:`MIN_EFFECTIVE` draws, or all of fewer. So bands have enough of
+    them, and are rather too wide.
+    """
+    draws, best = evidence.size, np.max(evidence)
+    if draws <= MIN_EFFECTIVE or not np.isfinite(best):
+        return np.arange(draws)
+
+    def effective(power: float) -> float:
+        weights = np.exp(power * (evidence - best))
+        return float(np.sum(weights) ** 2 / np.sum(weights**2))
+
+    low, power = 0.0, 1.0
+    if effective(power) < MIN_EFFECTIVE:
+        # Draws that are not possible never count.
+        high = power
+        for _ in range(50):
+            power = (low + high) / 2
+            low, high = (power, high) if effective(power) > MIN_EFFECTIVE else (low, power)
+    total = np.cumsum(np.exp(power * (evidence - best)))
+    # Evenly: of equal weights, each draw once.
+    levels = (np.arange(draws) + generator.uniform()) / draws
+    rows: IntArray = np.minimum(np.searchsorted(total, levels * total[-1]), draws - 1)
+    return rows

@@ -19,6 +19,7 @@ from hypothesis import given, strategies as st
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.likelihood import Readings
 from bwbayes.inference.noise import (
     DISCREPANCY_SD,
     DISCREPANCY_TIME,
@@ -26,7 +27,6 @@ from bwbayes.inference.noise import (
     DiscrepancyNoise,
     noise_model,
 )
-from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise, powers, root
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Distribution

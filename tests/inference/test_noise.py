@@ -15,14 +15,14 @@ import scipy
 from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.likelihood import Readings
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import rate
-from bwbayes.prediction.discrepancy_state import filter_discrepancy
+from bwbayes.prediction.initial_state import filter_discrepancy
 from tests.inference.problems import (
     INTERVAL,
     decaying_sine,

@@ -15,13 +15,13 @@ import pytest
 from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.importance import MIN_EFFECTIVE, resample
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Creep
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.initial_state import MIN_EFFECTIVE, resample
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests.inference.problems import posterior_of

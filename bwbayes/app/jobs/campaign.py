@@ -33,7 +33,7 @@ from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.progress import LastLine, StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
-from bwbayes.app.study.column_options import open_like
+from bwbayes.app.study.records import open_like
 from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import ValidationSummary

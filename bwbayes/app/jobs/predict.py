@@ -13,7 +13,7 @@ import numpy as np
 
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
-from bwbayes.app.study.column_options import open_like
+from bwbayes.app.study.records import open_like
 from bwbayes.errors import InputError, path_text, suggestion
 from bwbayes.inference.study import InitialConditions, Validation
 from bwbayes.record import Record

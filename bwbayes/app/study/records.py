@@ -4,6 +4,10 @@ Where a measurement goes on in the next file, the actuator's state, the offset a
 go on with it. Taken for a record of its own the second half would have an unknown start, and what
 the discrepancy remembers over the cut would be lost. So records that say what they continue are put
 together before anything else is done with them, and the fit is that of the whole.
+
+A run stores its records under the package's own names. It notes how the columns of the original
+file were read, and the names of all of them: a file beside a run that has no others is of the same
+kind, and is read as the record was.
 """
 
 from __future__ import annotations
@@ -27,10 +31,13 @@ from bwbayes.app.config.settings import (
 from bwbayes.app.study.parameters import stand_of
 from bwbayes.errors import ColumnsError, InputError, InputWarning, suggestion
 from bwbayes.inference.study import InitialConditions, Slices, Validation, generator, place_of
+from bwbayes.model.inputs import VoltageIs
 from bwbayes.model.registry import STAGES
+from bwbayes.quantities import Quantities
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
-from bwbayes.record.io.formats import read_named
+from bwbayes.record.io.formats import read_named, read_source
+from bwbayes.record.io.series import Source
 from bwbayes.record.record import Window
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
@@ -368,3 +375,53 @@ def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict
             cuts.append(cut)
         slices[key] = tuple(cuts)
     return slices.pop(""), slices
+
+
+# Options by which another file of the same columns is read, too.
+KEPT = ("units", "fs", "voltage_is", "input", "output", "linearity")
+
+
+def record_naming(source: RecordConfig, record: Record) -> dict[str, Any] | None:
+    """Return what to note of how a record was read from its file, if anything."""
+    stated = {
+        key: getattr(source, key)
+        for key in (*KEPT, "columns", "covariates")
+        if getattr(source, key) is not None
+    }
+    if not stated or source.file is None:
+        return None
+    by_key, names = Quantities.of(source.input, source.output).by_key, record.read_as["columns"]
+    quantities = {key: by_key.get(key.casefold(), key) for key in source.columns or {}}
+    columns = {
+        key: names[quantity]
+        for key, quantity in quantities.items()
+        if quantity != "displacement" or source.displacement_file is None
+    }
+    return {**stated, "columns": columns, "all_columns": record.read_as["all_columns"]}
+
+
+def open_like(
+    path: str | Path, noted: Mapping[str, Any] | None, reading: Mapping[str, Any] | None = None
+) -> tuple[Source, Naming, VoltageIs | None]:
+    """Return a file's content, its naming and the kind of its voltage, by what was noted.
+
+    A file that has other columns than the record had is named by itself. It may lack some, as a
+    planned voltage lacks the displacement. The user's own ``reading``, keyword arguments of
+    ``read_record``, comes first: with columns, units or a rate no note counts.
+
+    Raises InputError: the file cannot be read, or the user's reading is wrong.
+    """
+    options = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
+    source, noted = read_source(Path(path), options.get("table")), noted or {}
+    # The same quantities in whatever columns.
+    options = {key: noted[key] for key in ("input", "output") if key in noted} | options
+    names = {series.name for series in source.series}
+    is_like = bool(noted) and names <= {*noted.get("all_columns", ())}
+    if is_like and not options.keys() & {"columns", "units", "fs"}:
+        columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
+        further = Naming(covariates=noted.get("covariates", ())).covariate_columns
+        covariates = {name: column for name, column in further.items() if column in names}
+        kept = {key: noted[key] for key in noted if key in KEPT}
+        options = {"covariates": covariates} | kept | options | {"columns": columns}
+    voltage_is = options.pop("voltage_is", None)
+    return source, Naming.stated(**options), voltage_is

@@ -16,10 +16,10 @@ from pathlib import Path
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import ModelConfig, ParameterConfig, RecordConfig
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.study.column_options import record_naming
 from bwbayes.app.study.parameters import recoverable, study_of
 from bwbayes.app.study.records import (
     join_records,
+    record_naming,
     require_alike,
     training_records,
     validations_of,

@@ -97,7 +97,7 @@ def whiten(
     """Whiten as :meth:`~bwbayes.inference.state_space.Noise.whiten` does, for noise with states.
 
     The arguments are the same: θ (models, parameters) of the noise, series (models, series,
-    readings), um; and the readings' gaps (:attr:`~bwbayes.inference.readings.Readings.gaps`).
+    readings), um; and the readings' gaps (:attr:`~bwbayes.inference.likelihood.Readings.gaps`).
     """
     steps = [_step(noise, theta, 1.0 + number) for number in gaps[0].tolist()]
     transitions, gained = (np.stack(matrices) for matrices in zip(*steps, strict=True))
