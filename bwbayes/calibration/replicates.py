@@ -32,12 +32,12 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
-from bwbayes.inference.study import InitialConditions
+from bwbayes.inference.study import Validation
 from bwbayes.model.inputs import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.prediction.initial_state import estimate_initial_states
 from bwbayes.prediction.prediction import predict_record, predict_windows, thin_draws
-from bwbayes.record.record import Record, Window
+from bwbayes.record.record import Record
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import init_chain, sample
@@ -77,71 +77,6 @@ class Simulated(NamedTuple):
         }[kind]
         assert values is not None
         return values
-
-
-@dataclass(frozen=True)
-class OtherRecord:
-    """Another record to be simulated, and predicted from the posterior of the one that is fitted.
-
-    Parameters
-    ----------
-    record
-        Its voltage and times. Its displacement only marks where there are readings; without
-        any it is a planned voltage, whose start nothing tells.
-    start
-        Its initial conditions.
-    window
-        Part of it (start, stop) that is predicted, s; by default all.
-    like
-        The record that was fitted whose own parameters it takes where nothing tells its own; by
-        default the first.
-    """
-
-    record: Record
-    start: InitialConditions = field(default_factory=InitialConditions)
-    window: Window | None = None
-    like: str = ""
-
-    def simulated(
-        self, posterior: Posterior, theta: FloatArray, generator: np.random.Generator
-    ) -> Simulated:
-        """Simulate it with the true parameters (1, parameters).
-
-        ``posterior`` is that of the record that was made with them, which tells the ranges of
-        voltage and offset.
-        """
-        planned = replace(self.record, displacement=None, truth=None)
-        start_states = estimate_initial_states(posterior, theta, planned, self.start, generator)
-        model = start_states.displacement(planned.inputs)[0]
-        if self.start.estimate_offset and self.record.displacement is not None:
-            model = model + posterior.single_record.extent * generator.standard_normal()
-        noise, parameters = (
-            posterior.single_record.noise,
-            posterior.single_record.table.noise(theta),
-        )
-        return Simulated.of(
-            replace(self.record, truth=None),
-            model,
-            noise.at(planned.interval),
-            parameters,
-            generator,
-        )
-
-    def predicted(
-        self,
-        posterior: Posterior,
-        draws: FloatArray,
-        simulated: Simulated,
-        generator: np.random.Generator,
-    ) -> tuple[Bands, Simulated, slice]:
-        """Predict it, once it is simulated; return that too, and the samples that are predicted."""
-        record, window = simulated.record, slice(0, simulated.model.size)
-        if self.record.displacement is None:
-            record = replace(record, displacement=None)
-        if self.window is not None:
-            window = record.window_slice(*self.window)
-        bands = predict_record(posterior, draws, record, self.start, generator, window=self.window)
-        return bands, simulated, window
 
 
 def band_coverage(
@@ -212,7 +147,9 @@ class CalibrationSetup:
         simulated record, by the record's name.
     others
         Other records, by name: simulated with the same truth, but with a start and an offset of
-        their own, and predicted with the parameters from the posterior.
+        their own, and predicted with the parameters from the posterior. Their displacement only
+        marks where there are readings; without any it is a planned voltage, whose start nothing
+        tells.
     source
         Where truths and records come from, if not from ``posterior``, whose parameters it must
         include. A calibration then must fail: on records that the analysis is wrong about.
@@ -226,7 +163,7 @@ class CalibrationSetup:
     posterior: Posterior
     plan: SamplingPlan
     held_out: Mapping[str, Sequence[slice]] = field(default_factory=dict)
-    others: Mapping[str, OtherRecord] = field(default_factory=dict)
+    others: Mapping[str, Validation] = field(default_factory=dict)
     source: Posterior | None = None
     around: Sampled | None = None
 
@@ -414,8 +351,34 @@ def _predictions(
     source = experiment.truth.with_readings(readings)
     true = np.stack([theta[name] for name in source.prior.names], axis=1)
     for name, other in experiment.others.items():
-        like = other.like or posterior.table.records[0]
-        another = other.simulated(source.for_record(like), source.table.of(true, like), others)
-        single, record_draws = posterior.for_record(like), posterior.select_draws(draws, like)
-        predictions[name] = [other.predicted(single, record_draws, another, others)]
+        made_with = source.for_record(other.of), source.table.of(true, other.of)
+        another, planned = _simulated_other(other, *made_with, others), other.record
+        assert planned is not None
+        record, window = another.record, slice(0, another.model.size)
+        if planned.displacement is None:
+            record = replace(record, displacement=None)
+        if other.judged is not None:
+            window = record.window_slice(*other.judged)
+        alone = posterior.for_record(other.of), posterior.select_draws(draws, other.of)
+        predicted = predict_record(*alone, record, other.start, others, window=other.judged)
+        predictions[name] = [(predicted, another, window)]
     return predictions
+
+
+def _simulated_other(
+    other: Validation, posterior: Posterior, theta: FloatArray, generator: np.random.Generator
+) -> Simulated:
+    """Simulate another record with the true parameters (1, parameters).
+
+    ``posterior`` is that of the record that was made with them, which tells the ranges of voltage
+    and offset.
+    """
+    record, training = other.record, posterior.single_record
+    assert record is not None
+    planned = replace(record, displacement=None, truth=None)
+    start_states = estimate_initial_states(posterior, theta, planned, other.start, generator)
+    model = start_states.displacement(planned.inputs)[0]
+    if other.start.estimate_offset and record.displacement is not None:
+        model = model + training.extent * generator.standard_normal()
+    noise, parameters = training.noise.at(planned.interval), training.table.noise(theta)
+    return Simulated.of(replace(record, truth=None), model, noise, parameters, generator)

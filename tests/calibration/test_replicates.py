@@ -14,7 +14,6 @@ from bwbayes.calibration.evaluation import Calibration, evaluate_calibration, sm
 from bwbayes.calibration.replicates import (
     RANKED,
     CalibrationSetup,
-    OtherRecord,
     Replicate,
     Sampled,
     replicate,
@@ -22,7 +21,7 @@ from bwbayes.calibration.replicates import (
 from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.noise import WhiteNoise
-from bwbayes.inference.study import InitialConditions
+from bwbayes.inference.study import InitialConditions, Validation
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
@@ -190,16 +189,17 @@ def test_readings_of_both_enter(around: CalibrationSetup) -> None:
 # Simulated records
 
 
-def another(**changes: object) -> OtherRecord:
+def another(**changes: object) -> Validation:
     """Return a sine of another rate; the last reading is missing, and a tenth is the lead-in."""
     voltage = 60 * np.sin(2 * np.pi * np.arange(200) / 100 + 1)
     reading = np.where(np.arange(200) < 199, 0.0, np.nan)
-    other = OtherRecord(Record(voltage, reading, interval=0.005), InitialConditions(lead_in=0.1))
+    record = Record(voltage, reading, interval=0.005)
+    other = Validation((), record, InitialConditions(lead_in=0.1))
     return replace(other, **changes)  # type: ignore[arg-type]
 
 
 def test_bands_of_other_records_are_held_against_them(third: Replicate) -> None:
-    common = small(others={"one": another(), "part": another(window=(0.5, 1.0))})
+    common = small(others={"one": another(), "part": another(judged=(0.5, 1.0))})
     entry = replicate(common, 1, 3).entry
     assert list(common.bands) == list(entry["covered"])
     assert entry["covered"]["one sensor 50"] != entry["covered"]["part sensor 50"]

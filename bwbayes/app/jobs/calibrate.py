@@ -38,7 +38,6 @@ from bwbayes.calibration.replicates import (
     RANKED,
     CalibrationSetup,
     Entry,
-    OtherRecord,
     Sampled,
     replicate,
 )
@@ -91,7 +90,7 @@ def experiment(run: Run) -> CalibrationSetup:
         if (held_out := study.held_out(record))
     }
     others = {
-        name: OtherRecord(replace(v.record, instruments=EXACT), v.start, v.judged, v.of)
+        name: replace(v, record=replace(v.record, instruments=EXACT))
         for name, v in study.validations.items()
         if v.record is not None
     }
