@@ -204,14 +204,14 @@ class Span(NamedTuple):
 UNIT = Span(-1.0, 1.0)
 
 
-def narrower(span: Span, further: tuple[float, ...] = (0.8, 1.0, 1.25)) -> tuple[Span, ...]:
+def narrower(span: Span) -> tuple[Span, ...]:
     """Return ranges about a span's middle, evenly from next to nothing to all of it.
 
-    ``further`` is how far up they go, as parts of how far down.
+    Each goes up as far as it goes down, a fifth less and a quarter more.
     """
     low, center, half = span.low, span.middle, span.half
     # Fewer ranges leave steps that show; more take longer.
-    ends = [(k / 16, min(up * k / 16, 1.0)) for k in range(1, 17) for up in further]
+    ends = [(k / 16, min(up * k / 16, 1.0)) for k in range(1, 17) for up in (0.8, 1.0, 1.25)]
     return tuple(
         dict.fromkeys(Span(max(center - down * half, low), center + up * half) for down, up in ends)
     )

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.model.inputs import narrower
+from bwbayes.model.inputs import Span
 from bwbayes.watching import Watch, part, parts, unwatched, watched
 
 # Draws that are asked about each of many histories.
@@ -75,7 +75,8 @@ class States:
     the highest. Where one number holds all states, and a history is ``single``, they are what
     drives leave that were running when the record began, on the branches of their loops, the lowest
     and the highest as far out as any drive leaves them: half of the drives went over the whole
-    range, half were of any amplitude.
+    range, half over any part of it. A drive over its lower part alone leaves states above those of
+    the whole range: on the way up it has had less to make up for.
     """
 
     def __init__(self, likelihood: Likelihood, theta: FloatArray, *, single: bool) -> None:
@@ -89,7 +90,8 @@ class States:
         low, high = actuator.hysteresis.reachable(column, voltage, span)
         self.ordered = np.stack([low, low, high, high])
         if single:
-            ranges = narrower(span, further=(1.0,))
+            ends = np.linspace(*span, 9).tolist()
+            ranges = [Span(*pair) for pair in combinations(ends, 2)]
             states = [actuator.hysteresis.left(column, voltage, swept) for swept in ranges]
             widest = [actuator.hysteresis.left(column, voltage, span)] * len(ranges)
             self.ordered = np.sort(np.concatenate(states + widest), axis=0)
