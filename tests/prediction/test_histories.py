@@ -11,8 +11,9 @@ import pytest
 
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Span
+from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.prediction import initial_state
-from bwbayes.prediction.histories import choose_histories
+from bwbayes.prediction.histories import States, choose_histories
 from bwbayes.prediction.initial_state import estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
@@ -113,6 +114,29 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
     assert 0.04 < np.min(expected)
     assert np.max(expected) < 0.95
+
+
+def test_states_of_a_record_hold_those_after_any_drive() -> None:
+    """A drive that turns anywhere in the range, before a first voltage off its middle."""
+    posterior = posterior_of_case(Case())
+    first, rng = -50.0, np.random.default_rng(7)
+    likelihood = posterior.altered(voltage=np.linspace(first, 100.0, 400)).likelihood
+    actuator = replace(likelihood.actuator, span=Span(-100.0, 100.0))
+    likelihood = replace(likelihood, actuator=actuator, from_rest=False)
+    theta = posterior.prior.theta(np.empty((1, 0)))
+    states = States(likelihood, theta, single=True).ordered[[0, -1], 0]
+    column = likelihood.table.columns(theta)
+    operator = actuator.hysteresis
+    assert isinstance(operator, OneState)
+    left = []
+    for _ in range(300):
+        low, high = np.sort(rng.uniform(-100.0, 100.0, 2))
+        turns = rng.uniform(low, high, rng.integers(1, 12))
+        path = np.concatenate([[0.0], turns, [first]])
+        left.append(operator.trace(column, path, np.zeros(1))[1][0])
+    slack = 0.01 * np.ptp(states)
+    assert states[0] - slack <= min(left)
+    assert max(left) <= states[1] + slack
 
 
 def level_error(seed: int) -> tuple[float, float]:
