@@ -20,9 +20,10 @@ from bwbayes.diagnosis.loopfit import find_delay
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis, Sighting
 from bwbayes.diagnosis.series_patterns import strongest_line
 from bwbayes.inference.study import Stated
-from bwbayes.model.declaration import normal
+from bwbayes.model.declaration import Distribution, normal
 from bwbayes.model.registry import STAGES
 from bwbayes.model.stages.additions import Oscillation
+from bwbayes.model.stages.delay import Delay
 from bwbayes.model.stages.reversed_sign import ReversedSign
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
@@ -156,11 +157,13 @@ class _LongDelay(_Delay):
         The fits start from the modes for readings that are moved back by it.
         """
         record = scene.posterior.single_record
-        limit = min(0.55 * scene.turn_time, 0.2 * scene.duration)
+        prior = Delay.parameters[0].default(scene.study.contexts[""])
+        assert isinstance(prior, Distribution)
+        sd = prior.arguments["sd"]
         kept = np.full(record.displacement.size, np.nan)
         for window in record.training:
             kept[window] = record.displacement[window]
-        late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), limit)
+        late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), 2.2 * sd)
         rows = round(late / scene.interval)
         if abs(late) < max(scene.turn_time / 50, scene.interval / scene.stride) or not rows:
             return
@@ -168,8 +171,7 @@ class _LongDelay(_Delay):
         windows = (slice(0, kept.size),)
         moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=windows)
         places = scene.local_minima(moved)
-        # The score of the delay, as its prior's sd is a quarter of the time between two reversals.
-        yield Sighting(starts=[{"delay": 4 * late / scene.turn_time}], places=places)
+        yield Sighting(starts=[{"delay": late / sd}], places=places)
 
 
 def settle_fix(voltage: FloatArray, settled: int, leave_out: str) -> str:

@@ -190,21 +190,25 @@ def find_delay(record: Record, limit: float) -> tuple[float, float]:
     centered = record.displacement[rows] - record.displacement[rows].mean()
     trend = np.linspace(-0.5, 0.5, rows.size)
 
-    def missed(delay: float) -> float:
-        voltage = np.interp(time[rows] - delay, time, record.voltage)
-        if (voltage - voltage.mean()) @ centered <= 0:
-            return float(np.mean(centered**2))
-        (loops,) = _bases(voltage[np.newaxis], np.ones(rows.size, dtype=np.bool_))
-        basis = np.column_stack([loops, trend])
-        products = _products(basis, centered[:, np.newaxis])[:, 0]
-        fitted = (basis * (_inverse(_products(basis, basis)) @ products)).sum(axis=1)
-        return float(np.mean((centered - fitted) ** 2))
+    def missed(delays: FloatArray) -> list[float]:
+        voltages = np.interp(time[rows] - delays[:, np.newaxis], time, record.voltage)
+        left = []
+        every = np.ones(rows.size, dtype=np.bool_)
+        for voltage, loops in zip(voltages, _bases(voltages, every), strict=True):
+            basis = np.column_stack([loops, trend])
+            products = _products(basis, centered[:, np.newaxis])[:, 0]
+            fitted = (basis * (_inverse(_products(basis, basis)) @ products)).sum(axis=1)
+            rises = (voltage - voltage.mean()) @ centered > 0
+            left.append(float(np.mean((centered - fitted * rises) ** 2)))
+        return left
 
-    sizes = np.geomspace(min(record.interval, limit / 2), limit, 9)
-    tried = np.concatenate([-sizes[::-1], [0.0], sizes])
-    nearest = int(np.argmin([missed(delay) for delay in tried]))
+    # Loops imitate most of a delay: its own minimum is narrow.
+    tried = np.linspace(-limit, limit, 81)
+    nearest = int(np.argmin(missed(tried)))
     between = tried[max(nearest - 1, 0)], tried[min(nearest + 1, tried.size - 1)]
-    optimum = scipy.optimize.minimize_scalar(missed, bounds=between, method="bounded")
+    optimum = scipy.optimize.minimize_scalar(
+        lambda delay: missed(np.array([delay]))[0], bounds=between, method="bounded"
+    )
     return float(optimum.x), float(optimum.fun)
 
 

@@ -30,6 +30,7 @@ from bwbayes.diagnosis.series_patterns import (
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.model.inputs import turning_points
 from bwbayes.record.record import Record
+from bwbayes.shown import rounded
 
 # Kinds of findings about what a drive cannot show, which are no fault of the readings.
 UNTOLD = ("no reversal", "one amplitude", "few readings", "no hysteresis")
@@ -270,9 +271,10 @@ def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
     if _leads(voltage, _readings(record)[inside]):
         return None
     name = "displacement" if delay > 0 else "voltage"
-    text = f"the {name} is late by about {1e3 * abs(delay):.2g} ms"
+    text = f"the {name} is late by about {rounded(1e3 * abs(delay), 2)} ms"
     kind = f"{DEFECTS['delay'].finding} {name}"
-    return _whole(record, kind, text, late_fix(delay, record.interval))
+    fix = f"let a run fit the delay, or {late_fix(delay, record.interval)}"
+    return _whole(record, kind, text, fix)
 
 
 def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:

@@ -351,7 +351,14 @@ class ResidualAnalysis:
             readings = np.where(np.isfinite(readings), held, np.nan)
         return posterior.altered(
             displacement=readings, training=self.posterior.single_record.training
-        )
+        ).known()
+
+    def on_readings_of(self, posterior: Posterior) -> ResidualAnalysis:
+        """Return the analysis of the readings of another model, which may follow fewer of them."""
+        fit, before = _on_readings(self.fit, posterior), self.before
+        if fit is self.fit:
+            return self
+        return replace(self, fit=fit, before=before and _on_readings(before, posterior))
 
     def _of_whole(self, study: Study) -> Posterior:
         """Return the posterior of another model of the whole record."""
@@ -393,12 +400,13 @@ class ResidualAnalysis:
             return
         spec, stated = replace(self.study.spec, **parts).with_stages(*stages), sighting.stated
         posterior = self.rebuilt(self.study.with_model(spec, stated))
+        compared = self.on_readings_of(posterior)
         before = self.places if sighting.places is None else sighting.places
         places = []
         for coordinates, start in product(before, sighting.starts):
             values = {**dict(zip(self.posterior.names, coordinates, strict=True)), **start}
             places.append([values.get(name, 0.0) for name in posterior.names])
-        fit = self.extended(posterior, np.array(places))
+        fit = compared.extended(posterior, np.array(places))
         if not fit.follows:
             return
         text, advice = words or kind, ""
@@ -411,13 +419,13 @@ class ResidualAnalysis:
             fix = f"state {statement}" if spec == self.study.spec else f"{fix}, with {statement}"
         if advice:
             fix = advice if any(flags.values()) else f"{advice}, or {fix}"
-        yield self.explained(
+        yield compared.explained(
             kind,
             f"{text}{sighting.note}",
             fix,
             fit,
             sighting.cost,
-            shift=self._shift(fit),
+            shift=compared._shift(fit),
             spec=spec,
             stated=stated,
             coordinates=fit.coordinates,
@@ -434,7 +442,8 @@ class ResidualAnalysis:
         if not is_short or spec is None or coordinates is None:
             return explanation
         other = self._of_whole(self.study.with_model(spec, explanation.stated))
-        fit, before = climb(other, coordinates, watch=self.watch), self._on_all
+        fit = climb(other, coordinates, watch=self.watch)
+        before = _on_readings(self._on_all, other)
         nats = fit.log_evidence - before.log_evidence - explanation.cost
         return replace(explanation, nats=nats, rmse=(before.rmse, fit.rmse))
 
@@ -480,6 +489,16 @@ class ResidualAnalysis:
         variance = np.diag(self.fit.covariance)[rows] + np.diag(fit.covariance)[columns]
         moved = np.abs(fit.coordinates[columns] - self.fit.coordinates[rows]) / np.sqrt(variance)
         return float(np.max(moved, initial=0.0))
+
+
+def _on_readings(fit: LocalFit, other: Posterior) -> LocalFit:
+    """Return a fit without the readings that another posterior of the record does not have."""
+    missing = np.isnan(other.single_record.displacement)
+    readings = fit.posterior.single_record.displacement
+    if np.isnan(readings[missing]).all():
+        return fit
+    fewer = fit.posterior.altered(displacement=np.where(missing, np.nan, readings))
+    return climb(fewer, fit.coordinates)
 
 
 def lines(before: ModelSpec, after: ModelSpec) -> str:

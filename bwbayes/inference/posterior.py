@@ -227,6 +227,18 @@ class Posterior:
             fields["inputs"] = replace(self.single_record.inputs, voltage=voltage, covariates={})
         return replace(self, datasets=(replace(self.single_record, **fields),))
 
+    def known(self) -> Posterior:
+        """Return the posterior of those readings that 95% of the prior's models can follow."""
+        scores = np.array([[-1.96], [1.96]]) * np.ones(self.prior.dimensions)
+        theta = self.prior.theta(self.prior.constrain(scores)[0])
+        displacements = {}
+        for dataset in self.datasets:
+            model = dataset.table.actuator(self.table.of(theta, dataset.name))
+            displacements[dataset.name] = dataset.actuator.known(
+                model, dataset.displacement, from_rest=dataset.from_rest
+            )
+        return self.with_readings(displacements)
+
     def trained(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:
         """Return the posterior of other training windows of the same records, by name."""
         datasets = (replace(dataset, training=windows[dataset.name]) for dataset in self.datasets)

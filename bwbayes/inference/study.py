@@ -387,7 +387,7 @@ class Study:
         prior = JointPrior(parameters, first.actuator.hysteresis.holds)
         if not prior.dimensions:
             raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
-        return Posterior(tuple(datasets), prior, self.engine, table)
+        return Posterior(tuple(datasets), prior, self.engine, table).known()
 
     @cached_property
     def contexts(self) -> dict[str, Context]:

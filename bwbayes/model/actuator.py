@@ -384,6 +384,21 @@ class Actuator:
         """Return the columns (models,) of θ (models, parameters) by name."""
         return dict(zip(self.parameters, theta.T, strict=True))
 
+    def known(
+        self, theta: FloatArray, displacement: FloatArray, *, from_rest: bool = False
+    ) -> FloatArray:
+        """Return readings (samples,) that models θ (models, parameters) can follow; others are nan.
+
+        A stage may need inputs from before the record, unless it starts from rest, or behind it.
+        """
+        reaches = [(0.0, 0.0), *(stage.reach(self.columns(theta)) for stage in self.stages)]
+        before, behind = (math.ceil(sum(s) / self.interval) for s in zip(*reaches, strict=True))
+        if not before and not behind:
+            return displacement
+        samples = np.arange(displacement.size)
+        is_known = (samples >= before * (not from_rest)) & (samples < samples.size - behind)
+        return np.where(is_known, displacement, np.nan)
+
     def begin(
         self,
         column: Mapping[str, FloatArray],

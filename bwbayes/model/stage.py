@@ -92,6 +92,10 @@ class Stage(ABC):
         """Return what it sees of inputs, (samples,), if it sees any."""
         return inputs.column(self.sees) if self.sees else None
 
+    def reach(self, column: Values) -> tuple[float, float]:  # noqa: ARG002
+        """Return how far before and behind a sample it needs the inputs, s, of models (models,)."""
+        return 0.0, 0.0
+
     @staticmethod
     def settle(parameters: Any, value: Any, after: Any) -> Any:
         """Return what comes out once the stage is at rest at a value, and write its memory.

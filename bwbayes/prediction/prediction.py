@@ -112,6 +112,7 @@ def predict_windows(
         Called with the share that is done.
     """
     theta = posterior.prior.theta(draws)
+    record = _known(record, posterior, theta, from_rest=posterior.single_record.from_rest)
     start_states = training_initial_states(posterior, theta, generator)
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
     edges = [(window.start, window.stop) for parts in several.values() for window in parts]
@@ -219,6 +220,7 @@ def predict_record(
     """
     predicted_window = slice(0, record.samples) if window is None else record.window_slice(*window)
     theta = posterior.prior.theta(draws)
+    record = _known(record, posterior, theta, from_rest=start.from_rest)
     start_states = estimate_initial_states(
         posterior, theta, record, start, generator, part(watch, 0.0, STATES_SHARE)
     )
@@ -243,6 +245,16 @@ def predict_record(
         separate=True,
         model_error_sd=model_error_sd,
     )
+
+
+def _known(record: Record, posterior: Posterior, theta: FloatArray, *, from_rest: bool) -> Record:
+    """Return a record with those of its readings that draws θ (draws, parameters) can follow."""
+    if record.displacement is None:
+        return record
+    actuator = replace(posterior.single_record.actuator, interval=record.interval)
+    model = posterior.single_record.table.actuator(theta)
+    known = actuator.known(model, record.displacement, from_rest=from_rest)
+    return record if known is record.displacement else replace(record, displacement=known)
 
 
 def _bands(

@@ -34,6 +34,7 @@ from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
+from bwbayes.model.stages.delay import Delay
 from bwbayes.model.stages.gain import Temperature
 from bwbayes.model.stages.saturation import Saturation
 from bwbayes.record.teststand import RING_BENDER, true_values
@@ -44,7 +45,6 @@ SPAN = Span(-80.0, 80.0)
 INTERVAL = 1e-3
 VALUES = {
     "delay": 2.4e-3,
-    "delay_speed": 300.0,
     "amplifier_lag": 2e-3,
     "amplifier_lag_speed": 500.0,
     "slew_limit": 6e3,
@@ -266,6 +266,29 @@ def test_chains_agree_in_both_engines_and_in_pieces(
     np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-11 * size)
     alone = made.displacement(models[1:2], inputs, from_rest=from_rest)
     np.testing.assert_allclose(alone, whole[1:2], rtol=0, atol=1e-11 * size)
+
+
+@given(st.floats(-0.1, 0.1))
+def test_readings_that_need_the_voltage_beyond_their_record_are_left_out(delay: float) -> None:
+    """Those that are left do not depend on it; where all was at rest before, it is known."""
+    made, stage = actuator("delay"), Delay()
+    part = inputs_of(drive())[150:400]
+    alone, column = inputs_of(part.voltage.copy()), {"delay": np.array([delay])}
+    whole, cut = (
+        stage.advance(
+            stage.numbers_at(column, Timing(INTERVAL, "first"), inputs),
+            np.empty((1, 0)),
+            inputs.voltage[np.newaxis],
+            stage.seen(inputs),
+        )[0][0]
+        for inputs in (part, alone)
+    )
+    row = theta(made, 1)
+    row[:, made.parameters.index("delay")] = delay
+    known = np.isfinite(made.known(row, whole))
+    np.testing.assert_allclose(cut[known], whole[known], rtol=0, atol=1e-9)
+    assert np.sum(~known) == np.ceil(abs(delay) / INTERVAL)
+    assert np.isfinite(made.known(row, whole, from_rest=True)).all() == (delay >= 0)
 
 
 @pytest.mark.parametrize("names", [*((name,) for name in UNDONE), MANY])

@@ -143,4 +143,5 @@ def no_rivals(*_: object) -> None:
 
 def covered(bands: Bands, level: int = 95) -> float:
     assert bands.measured is not None
-    return float(np.mean(bands.covers("sensor", level, bands.measured)[bands.scored_from :]))
+    inside = bands.covers("sensor", level, bands.measured)
+    return float(np.mean(inside[bands.scored(bands.measured)]))

@@ -54,7 +54,7 @@ class ConfigProposal:
     @property
     def blocking_issue(self) -> Finding | None:
         """The first finding that makes a fit pointless, if any."""
-        kinds = ("no relation", "reversed sign", "swapped columns", "late voltage")
+        kinds = ("no relation", "reversed sign", "swapped columns")
         return next((finding for finding in self.findings if finding.kind in kinds), None)
 
 

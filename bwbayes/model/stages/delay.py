@@ -20,15 +20,14 @@ from bwbayes.model.stage import Side, Stage, Timing
 class Delay(Stage):
     """A delay: y(t) = u(t − δ), of the command u, V; the voltage is late where δ < 0.
 
-    It goes straight between samples, came at one speed before the first, and stays behind the last.
-    It is worked out of all samples at once, since it may be ahead: a controller does not have it.
-    The memory is the speed, V a sample.
+    It goes straight between samples, and stays before the first and behind the last: readings that
+    need the voltage there are left out. It is worked out of all samples at once, since it may be
+    ahead: a controller does not have it.
     """
 
     name: ClassVar = "delay"
     side: ClassVar[Side] = "input"
     sees: ClassVar = "voltage"
-    remembers: ClassVar = 1
     starts: ClassVar = tuple({"delay": z} for z in (-0.1, 0.0, 0.1))
     advice: ClassVar = "move the column that is late up by rows in the file"
     parameters: tuple[Declaration, ...] = (
@@ -37,18 +36,9 @@ class Delay(Stage):
             "s",
             r"\delta",
             "delay of the displacement behind the voltage",
-            # An eighth of a period: a quarter is another sign, nearly.
-            lambda context: normal(0.0, context.ranges.time / 4),
-        ),
-        Declaration(
-            "delay_speed",
-            "V/s",
-            r"v_{\delta}",
-            "speed of the voltage before the record",
-            # Twice the slope of a triangle.
-            lambda context: normal(0.0, 4 * context.ranges.voltage / context.ranges.time),
-            scope="record",
-            at_rest=0.0,
+            # Two sds are a quarter of a period, which nearly is another sign, and leave most of a
+            # record that has hardly one.
+            lambda context: normal(0.0, min(context.ranges.time / 4, context.ranges.duration / 10)),
         ),
     )
 
@@ -69,26 +59,13 @@ class Delay(Stage):
         """Return the whole path (any,), V, of which the inputs are a part."""
         return inputs.around[0]
 
-    @staticmethod
-    def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # any delay
-        """Return u: what stays is not late."""
-        after[0] = 0.0
-        return value
-
-    def begin(
-        self,
-        column: Values,
-        numbers: FloatArray,  # noqa: ARG002  # whatever the delay
-        first: FloatArray,  # noqa: ARG002
-        timing: Timing,
-    ) -> FloatArray:
-        """Return the speed before the record."""
-        return column["delay_speed"][:, np.newaxis] * timing.interval
+    def reach(self, column: Values) -> tuple[float, float]:
+        """Return the longest delay of either sign, s."""
+        return max(float(np.max(column["delay"])), 0.0), max(-float(np.min(column["delay"])), 0.0)
 
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
         """Return u, of a sample by itself."""
-        after[0] = memory[0]
         return value
 
     @staticmethod
@@ -106,17 +83,16 @@ class Delay(Stage):
         """Return the path as late as each model has it, (models, samples)."""
         if seen is None:
             return values, memory
-        return _late(numbers, memory, seen, values.shape[1]), memory
+        return _late(numbers, seen, values.shape[1]), memory
 
     def inverse(
         self,
         numbers: FloatArray,
-        memory: FloatArray,
+        memory: FloatArray,  # noqa: ARG002
         values: FloatArray,
         seen: FloatArray | None = None,  # noqa: ARG002  # what is sought
     ) -> FloatArray:
         """Return the commands (models, samples) of which these are late."""
-        values = values - _late(numbers, memory, np.zeros(1), values.shape[1])
         commands = np.empty(values.shape)
         for row, (shift,) in enumerate(numbers.tolist()):
             floor = int(np.floor(shift))
@@ -134,15 +110,10 @@ class Delay(Stage):
         return commands
 
 
-def _late(shifts: FloatArray, speed: FloatArray, path: FloatArray, samples: int) -> FloatArray:
-    """Return the first samples of a path (any,), V, late by shifts (models, 1), in samples.
-
-    Before its first sample the path came at a speed (models, 1), V a sample.
-    """
+def _late(shifts: FloatArray, path: FloatArray, samples: int) -> FloatArray:
+    """Return the first samples of a path (any,), V, late by shifts (models, 1), in samples."""
     floor = np.floor(shifts)
     after = np.arange(samples) - floor.astype(np.intp)
-    late, before = (
-        path[np.clip(at, 0, path.size - 1)] + speed * np.minimum(at, 0) for at in (after, after - 1)
-    )
+    late, before = (path[np.clip(at, 0, path.size - 1)] for at in (after, after - 1))
     result: FloatArray = late + (shifts - floor) * (before - late)
     return result
