@@ -187,18 +187,20 @@ def find_delay(record: Record, limit: float) -> tuple[float, float]:
     rows = rows[record.has_reading[rows]]
     time, begin = record.time, record.start
     rows = rows[(time[rows] >= begin + limit) & (time[rows] <= begin + record.duration - limit)]
-    centered = record.displacement[rows] - record.displacement[rows].mean()
-    trend = np.linspace(-0.5, 0.5, rows.size)
+    # Half a period, after which loops do not depend on the start, or half of a short record.
+    is_fitted = time[rows] >= begin + min(3 * limit, record.duration / 2)
+    displacement = record.displacement[rows[is_fitted]]
+    centered = displacement - displacement.mean()
+    trend = np.linspace(-0.5, 0.5, centered.size)
 
     def missed(delays: FloatArray) -> list[float]:
         voltages = np.interp(time[rows] - delays[:, np.newaxis], time, record.voltage)
         left = []
-        every = np.ones(rows.size, dtype=np.bool_)
-        for voltage, loops in zip(voltages, _bases(voltages, every), strict=True):
+        for voltage, loops in zip(voltages, _bases(voltages, is_fitted), strict=True):
             basis = np.column_stack([loops, trend])
             products = _products(basis, centered[:, np.newaxis])[:, 0]
             fitted = (basis * (_inverse(_products(basis, basis)) @ products)).sum(axis=1)
-            rises = (voltage - voltage.mean()) @ centered > 0
+            rises = voltage[is_fitted] @ centered > 0
             left.append(float(np.mean((centered - fitted * rises) ** 2)))
         return left
 

@@ -226,10 +226,13 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that does not follow the voltage, or the wrong way, or ahead of it."""
     voltage, displacement = record.voltage[record.has_reading], _readings(record)
     leads = _leads(voltage, displacement)
-    late = None if leads is False and loop.missed < 0.02 else _late(record, loop, 5.0)
-    if late is not None:
-        yield late
-        return
+    # A falling displacement whose loops lag has two faults, unless a column is late, which is one.
+    falls_and_lags = loop.gain < 0 and leads is False
+    if leads is not False or loop.missed >= 0.02 or falls_and_lags:
+        late = _late(record, loop, 1.0 if falls_and_lags else 5.0)
+        if late is not None:
+            yield late
+            return
     # Loops of another sign or sense imitate most of a motion that only coincides with the drive.
     limit = 0.03 if leads or loop.gain < 0 else 0.3
     # Rounding to coarse steps is off by half a step at most.
