@@ -7,6 +7,8 @@ prior and gives its log density, up to the one constant that the cut leaves. It 
 to coordinates without bounds and back: the normal scores of each prior between the bounds that hold
 there. In them every prior is nearly a standard normal, whatever its scale and bounds, and so a
 posterior has Gaussian tails even where it leans on a bound (γ near β, a discrepancy near zero).
+Where a record determines but the sum of parameters, as that of a delay and a lag, the sum takes the
+place of one of them: lags are logarithms there, and the posterior would be thin and curved.
 """
 
 from __future__ import annotations
@@ -174,6 +176,12 @@ class JointPrior:
         rows, logarithmic, center, scale = table.T[:, :, np.newaxis]
         self._formulas = rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
         self._cut = [(row, self.free[row]) for row, f in forms.items() if f is None]
+        # Parameters whose coordinates are those of a sum, and the rows of the others in it.
+        self._sums = [
+            (row, form, others)
+            for row, form in forms.items()
+            if form is not None and not form.logarithmic and (others := self._summed_with(row))
+        ]
         # Values that free parameters must exceed, or reach: two columns.
         floors = np.array([p.floor for p in self.free])[:, np.newaxis]
         reaches = [p.declared.reaches_floor for p in self.free]
@@ -197,6 +205,15 @@ class JointPrior:
                 )
         if not np.all(self._possible(fixed)):
             raise InputError(f"priors: fixed values must have {self._stated()}")
+
+    def _summed_with(self, row: int) -> list[int]:
+        """Return the rows of the free parameters in whose sum a record shows a free one."""
+        parameter = self.free[row]
+        return [
+            other
+            for other, p in enumerate(self.free)
+            if p.plain in parameter.declared.summed_with and p.record in ("", parameter.record)
+        ]
 
     def _stated(self) -> str:
         """Return the physical constraints in words."""
@@ -246,11 +263,13 @@ class JointPrior:
 
     def unconstrain(self, free: FloatArray) -> FloatArray:
         """Map free parameters (models, free), inside their bounds, to coordinates."""
-        values = self._values(free)
+        values, summed = self._values(free), free.T.copy()
+        for row, _, others in self._sums:
+            summed[row] += summed[others].sum(axis=0)
         scores = []
-        for parameter in self.free:
+        for parameter, x in zip(self.free, summed, strict=True):
             bounds = self._limits(parameter, values)
-            scores.append(parameter.distribution.to_normal(values[parameter.name], *bounds))
+            scores.append(parameter.distribution.to_normal(x, *bounds))
         return np.clip(np.stack(scores, axis=1), -FARTHEST, FARTHEST)
 
     def constrain(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -263,6 +282,7 @@ class JointPrior:
             log p(z) = Σ log φ(z) + Σ log(F(u) − F(l)) + constant,
 
         −∞ where earlier parameters leave no room, or z is beyond anything that can be told apart.
+        Where the coordinate is that of a sum, the others are taken from x, and φ is that of x.
         """
         # A parameter is a row here, so that what is done with one is done with neighbors.
         unclipped = np.ascontiguousarray(coordinates.T)
@@ -278,6 +298,9 @@ class JointPrior:
             bounds = self._limits(parameter, values)
             free[row], between = parameter.distribution.from_normal(safe[row], *bounds)
             room *= between
+        for row, form, others in self._sums:
+            free[row] -= free[others].sum(axis=0)
+            safe[row] = form.score(free[row])
         # Rounding may put a positive parameter on its open bound, where there is no model.
         possible &= ((free > self._above) & (free >= self._at_least)).all(axis=0)
         possible &= self._possible(values)

@@ -229,8 +229,8 @@ class Posterior:
 
     def known(self) -> Posterior:
         """Return the posterior of those readings that 95% of the prior's models can follow."""
-        scores = np.array([[-1.96], [1.96]]) * np.ones(self.prior.dimensions)
-        theta = self.prior.theta(self.prior.constrain(scores)[0])
+        ends = [p.distribution.form.value(np.array([-1.96, 1.96])) for p in self.prior.free]
+        theta = self.prior.theta(np.stack(ends, axis=1))
         displacements = {}
         for dataset in self.datasets:
             model = dataset.table.actuator(self.table.of(theta, dataset.name))

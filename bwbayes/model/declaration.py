@@ -322,6 +322,9 @@ class Declaration:
         that are fixed. There are none (:meth:`limits`) where one that it asks for is not known yet.
     stated_bounds
         The bounds in words, for messages: ``|gamma| <= beta``.
+    summed_with
+        Parameters in the same unit, of which a record determines the sum with this one far better
+        than each. Its coordinate is that of the sum, if its prior is normal.
     pressed
         Advice where the posterior presses against the lower or upper of these bounds, or of
         the default prior's where there are none.
@@ -353,6 +356,7 @@ class Declaration:
     limit_at_floor: bool = False
     bounds: Callable[[Values], tuple[ArrayLike, ArrayLike]] | None = None
     stated_bounds: str = ""
+    summed_with: tuple[str, ...] = ()
     pressed: Mapping[str, str] = field(default_factory=dict)
     scope: Scope = "actuator"
     loop: bool = False

@@ -17,7 +17,7 @@ from tests.inference.problems import joint_prior, single
 
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
 ALL = (*HYSTERESIS, "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
-RANGES = Ranges(voltage=100.0, displacement=60.0, middle=3.0, time=0.5)
+RANGES = Ranges(voltage=100.0, displacement=60.0, middle=3.0, time=0.5, duration=8.0)
 
 WIDE = {
     # Priors that the constraints cut hard, on every side.
@@ -45,6 +45,7 @@ def active(prior: JointPrior) -> JointPrior:
 
 PRIORS = {
     "default": joint_prior(ALL, RANGES, {}),
+    "summed": joint_prior((*ALL, "delay"), RANGES, {}),
     "cut": cut_prior(),
     "alpha fixed": cut_prior(alpha=0.6),
     "gamma fixed": cut_prior(gamma=-0.03),

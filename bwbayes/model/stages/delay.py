@@ -15,6 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.stage import Side, Stage, Timing
+from bwbayes.model.stages.lags import TIME_CONSTANTS
 
 
 class Delay(Stage):
@@ -39,6 +40,8 @@ class Delay(Stage):
             # Two sds are a quarter of a period, which nearly is another sign, and leave most of a
             # record that has hardly one.
             lambda context: normal(0.0, min(context.ranges.time / 4, context.ranges.duration / 10)),
+            # A lag delays slow drives by its time constant.
+            summed_with=TIME_CONSTANTS,
         ),
     )
 
