@@ -112,7 +112,10 @@ def predict_windows(
         Called with the share that is done.
     """
     theta = posterior.prior.theta(draws)
-    record = _known(record, posterior, theta, from_rest=posterior.single_record.from_rest)
+    if record.displacement is not None:
+        # What no fit has followed says nothing of it.
+        left_out = np.isnan(posterior.single_record.displacement)
+        record = replace(record, displacement=np.where(left_out, np.nan, record.displacement))
     start_states = training_initial_states(posterior, theta, generator)
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
     edges = [(window.start, window.stop) for parts in several.values() for window in parts]
