@@ -83,6 +83,7 @@ def findings_of(study: Study) -> dict[str, tuple[Finding, ...]]:
         no_matter += UNTOLD
     if study.spec.operator.name == "linear":
         no_matter += tuple(kind for kind in UNTOLD if kind != "few readings")
+    no_matter += _followed(study)
     findings = {}
     for name, record in study.records.items():
         # Borders that differ by less than half a sample are the same.
@@ -112,7 +113,9 @@ def record_remarks(
     remarks += [
         f"{name}: {finding}" for name, all_ in findings_of(study).items() for finding in all_
     ]
-    remarks += [text for name, other in study.others.items() for text in _unlike(name, other)]
+    remarks += [
+        text for name, other in study.others.items() for text in _unlike(name, other, study)
+    ]
     remarks += [
         (f"{name}: " if len(study.records) > 1 else "") + _set_aside(source.outliers, record)
         for (name, source), record in zip(sources.items(), study.records.values(), strict=True)
@@ -124,13 +127,18 @@ def record_remarks(
     return tuple(remarks)
 
 
-def _unlike(name: str, record: Record) -> Iterator[str]:
+def _followed(study: Study) -> tuple[str, ...]:
+    """Return the kinds of findings that the model itself takes into account."""
+    return ("late displacement", "late voltage") if "delay" in study.spec.chain else ()
+
+
+def _unlike(name: str, record: Record, study: Study) -> Iterator[str]:
     """Yield what is wrong with a record that is predicted."""
     for finding in inspect(record):
         fix = finding.fix
         if finding.kind == "switch-on transient":  # nothing here is fitted
             fix = f"lead_in_start = {record.clock(finding.stop)} under [validation.{name}]"
-        if finding.kind not in UNTOLD:
+        if finding.kind not in UNTOLD + _followed(study):
             yield f"{name}: {replace(finding, fix=fix)}"
 
 
