@@ -168,25 +168,18 @@ class Run(Shown):
 
         return record_remarks(self.config, self.study, self.extrapolations)
 
-    @property
-    def state(self) -> str:
-        """A digest of study and chain as they are now."""
-        from bwbayes.app.running.fingerprint import state_of
-
-        return state_of(self)
-
     @cached_property
     def kept(self) -> dict[str, Any]:
         """Results computed before from the chain as it is now, by stage; none if it has grown."""
-        from bwbayes.app.running.fingerprint import load
+        from bwbayes.app.running.fingerprint import load, state_of
 
-        return load(self.folder.result, self.state) or {}
+        return load(self.folder.result, state_of(self)) or {}
 
     def keep(self, folder: RunFolder) -> None:
         """Write what is computed to a folder: all that neither the chain nor the config holds."""
-        from bwbayes.app.running.fingerprint import save
+        from bwbayes.app.running.fingerprint import save, state_of
 
-        save(folder.result, self.state, {"outcome": self.outcome, **self._computed})
+        save(folder.result, state_of(self), {"outcome": self.outcome, **self._computed})
 
     @cached_property
     def outcome(self) -> SamplingResult:
@@ -539,8 +532,10 @@ class Run(Shown):
     @property
     def calibration(self) -> dict[str, Any] | None:
         """How ``bwbayes calibrate`` came out for the run as it is now; None if it was not run."""
+        from bwbayes.app.running.fingerprint import state_of
+
         numbers = self.folder.calibration.numbers()
-        if numbers.get("of") != self.state:
+        if numbers.get("of") != state_of(self):
             return None
         names = ("passed", "telling", "failures", "replicates", "unconverged")
         return {name: numbers[name] for name in names}

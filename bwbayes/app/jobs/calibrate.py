@@ -27,7 +27,7 @@ from rich.console import Console
 from bwbayes.app.config.config import Config, dump
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import console_of
-from bwbayes.app.running.fingerprint import versions
+from bwbayes.app.running.fingerprint import state_of, versions
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.run import redraw
@@ -177,7 +177,7 @@ def calibrate(
         bwbayes calibrate results/my
     """
     console = console_of(progress)
-    posterior, folder = fit.study.posterior, fit.folder.calibration
+    posterior, folder, state = fit.study.posterior, fit.folder.calibration, state_of(fit)
     flat = draws(posterior, fit.chain).reshape(-1, len(posterior.names))
     flat = thin_draws(flat, fit.study.generator("truths"))
     # A rank among 199 draws needs no more.
@@ -187,10 +187,10 @@ def calibrate(
         if overwrite or not folder.replicates.exists():
             shutil.rmtree(folder.path, ignore_errors=True)
             folder.path.mkdir()
-            request = _Request(replicates=replicates or 200, of=fit.state)
+            request = _Request(replicates=replicates or 200, of=state)
             _append(folder, request.model_dump_json())
         calibration = _finish(
-            fit.with_cache(folder=folder), common, fit.state, console, replicates, workers, executor
+            fit.with_cache(folder=folder), common, state, console, replicates, workers, executor
         )
     if fit.folder.summary.exists():
         with StepProgress(console, "writing the run's report ...") as watch:

@@ -22,7 +22,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation
-from bwbayes.diagnosis.rivals import Rival, disagreement
+from bwbayes.diagnosis.rivals import disagreement
 from bwbayes.diagnosis.validation import (
     BandValidation,
     ValidationSummary,
@@ -358,7 +358,8 @@ def predict_after(
     source = study.generator(f"forecast {planned.sha256}")
     alone, own_draws = reaching(study, run.subset, of, longer, beyond)
 
-    error, rivals = None, _widening_rivals(run, of, beyond, part(watch, 0.0, 0.5))
+    error = None
+    rivals = run.widening_rivals(of, part(watch, 0.0, 0.5)) if beyond else None
     if rivals is not None:
         rng = study.generator(f"rivals {planned.sha256}")
 
@@ -409,7 +410,8 @@ def _of_another(
     study, record = run.study, other.record
     assert record is not None
     alone, own_draws = reaching(study, draws, other.of, record, beyond)
-    error, rivals = None, _widening_rivals(run, other.of, beyond, part(watch, 0.0, 0.5))
+    error = None
+    rivals = run.widening_rivals(other.of, part(watch, 0.0, 0.5)) if beyond else None
     if rivals is not None:
         rng = study.generator(f"rivals {record.sha256}")
 
@@ -422,13 +424,6 @@ def _of_another(
     return predict_record(
         alone, own_draws, record, other.start, source, name, other.judged, predicting, error
     )
-
-
-def _widening_rivals(
-    run: Run, of: str, beyond: Iterable[Finding], watch: Watch
-) -> Sequence[Rival] | None:
-    """Return the rivals that widen the bands of a drive; None of a drive like those of training."""
-    return run.widening_rivals(of, watch) if beyond else None
 
 
 def reaching(
