@@ -37,7 +37,7 @@ from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding, join_findings
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import ExitStatus, InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.prediction.bands import Bands, title_of
+from bwbayes.prediction.bands import Bands
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import brief, rounded
 
@@ -98,8 +98,8 @@ class BandValidation:
 
     Attributes
     ----------
-    name, training, separate
-        Those of the bands.
+    where, training
+        Title of the bands, and whether they are those of fitted readings.
     passed
         False if the bands fail one of the tests; None if the outcome may be chance, or the record
         is too short.
@@ -115,23 +115,17 @@ class BandValidation:
 
     __repr__ = brief
 
-    name: str
+    where: str
     training: bool
     passed: bool | None
     reasons: tuple[str, ...] = ()
     cause: Finding | None = None
     notes: tuple[str, ...] = ()
-    separate: bool = False
 
     @property
     def status(self) -> str:
         """The outcome in a word."""
         return STATUSES[self.passed]
-
-    @property
-    def where(self) -> str:
-        """Name and kind of the record."""
-        return title_of(self.name, training=self.training, separate=self.separate)
 
     @property
     def line(self) -> str:
@@ -250,7 +244,7 @@ def validate_bands(
     standard = StandardizedResiduals.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
     width = (standard.excess_width,) if bands.training and standard.excess_width else ()
-    verdict = BandValidation(bands.name, bands.training, True, notes=width, separate=bands.separate)
+    verdict = BandValidation(bands.title, bands.training, True, notes=width)
     # A lead-in that does not fit is noted only if the readings after it show a departure.
     lead, doubted = bands.lead_in, verdict
     off = bool(reasons or standard.chances())

@@ -117,10 +117,9 @@ class Posterior:
         has fewer rows than there are models, models take its rows in turn.
         """
         total = np.zeros(len(theta))
-        of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)
-        for dataset, likelihood, columns in of_records:
+        for likelihood, columns in zip(self.likelihoods, self._columns, strict=True):
             moved = None if displacement is None else displacement[:, columns]
-            total += likelihood.log_density(self.table.of(theta, dataset.name), moved)
+            total += likelihood.log_density(self.table.of(theta, likelihood.name), moved)
         return total
 
     @cached_property
@@ -151,12 +150,12 @@ class Posterior:
 
         Each is (some models, rows), in the order of θ.
         """
-        number = 0 if record is None else self.table.records.index(record)
-        dataset = self.single_record if record is None else self.datasets[number]
-        likelihood, theta = self.likelihoods[number], self.table.of(theta, dataset.name)
-        model = dataset.table.actuator(theta)
+        name = self.single_record.name if record is None else record
+        likelihood = next(each for each in self.likelihoods if each.name == name)
+        theta = self.table.of(theta, name)
+        model = likelihood.table.actuator(theta)
         initial_transient = likelihood.start(theta).mean if likelihood.unknowns else None
-        inputs = dataset.inputs[: dataset.training[-1].stop]
+        inputs = likelihood.inputs[: likelihood.training[-1].stop]
 
         for batch in batches(len(theta), inputs.samples):
             moving = None if initial_transient is None else initial_transient[batch]
@@ -176,10 +175,9 @@ class Posterior:
         """
         possible = np.flatnonzero(np.isfinite(log_prior))
         result = np.full((len(theta), self._columns[-1].stop), np.nan)
-        of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)
-        for dataset, likelihood, columns in of_records:
+        for likelihood, columns in zip(self.likelihoods, self._columns, strict=True):
             readings = likelihood.readings
-            model = likelihood.table.actuator(self.table.of(theta, dataset.name))
+            model = likelihood.table.actuator(self.table.of(theta, likelihood.name))
             for batch in batches(possible.size, readings.samples):
                 models = possible[batch]
                 moved = likelihood.simulate(model[models], likelihood.inputs_read)
@@ -192,12 +190,13 @@ class Posterior:
         ``shapes`` (models, shapes, readings) and ``displacement`` (models, readings), um, are of
         the readings of all records, one after the other.
         """
-        of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)
         scores = [
             likelihood.score(
-                self.table.of(theta, dataset.name), shapes[..., columns], displacement[:, columns]
+                self.table.of(theta, likelihood.name),
+                shapes[..., columns],
+                displacement[:, columns],
             )
-            for dataset, likelihood, columns in of_records
+            for likelihood, columns in zip(self.likelihoods, self._columns, strict=True)
         ]
         return Score(*(np.sum(parts, axis=0) for parts in zip(*scores, strict=True)))
 

@@ -28,12 +28,6 @@ LEVELS = (50, 90, 95)
 WIDTH_90 = float(2 * scipy.special.ndtri(0.95))
 
 
-def title_of(name: str, *, training: bool, separate: bool) -> str:
-    """Return the name of bands, and what they are of."""
-    kind = "training" if training else "separate record" if separate else "held out"
-    return name if name == kind else f"{name} ({kind})"
-
-
 @dataclass(frozen=True)
 class LeadIn:
     """The stretch that told a record's start, and how well it fits.
@@ -129,6 +123,12 @@ class Bands:
     model_error_sd: float | None = None
     correction: Correction | None = None
     read_sds: dict[Kind, FloatArray] | None = None
+
+    @property
+    def title(self) -> str:
+        """The name of the bands, and what they are of."""
+        kind = "training" if self.training else "separate record" if self.separate else "held out"
+        return self.name if self.name == kind else f"{self.name} ({kind})"
 
     @property
     def corrected(self) -> tuple[FloatArray, FloatArray] | None:

@@ -26,7 +26,6 @@ from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
 from bwbayes.report.calibration import outcome
 from bwbayes.report.figures import Pictures, pictures as all_pictures
-from bwbayes.report.figures.style import title
 from bwbayes.report.report import (
     UNKNOWN,
     Banner,
@@ -199,7 +198,7 @@ def _results(result: Result) -> list[Text]:
                 "<b>{}</b>: {}Coverage of the 95% sensor band: <b>{}</b>. Mean width: <b>{}</b>. "
                 "NRMSE: {}. Max error: {}."
             ).format(
-                f"{title(bands)}, {_span(bands)}",
+                f"{bands.title}, {_span(bands)}",
                 status,
                 coverage_text(scores, "sensor", 95),
                 length_text(scores.width_um[95]),
@@ -224,7 +223,7 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
         shown += [p for name, p in pictures.items() if name.partition("_")[0] == kind]
     validation: list[Block] = []
     if result.scores:
-        titles = {bands.name: title(bands) for bands in ordered if bands.name in result.scores}
+        titles = {bands.name: bands.title for bands in ordered if bands.name in result.scores}
         scores = {name: result.scores[name] for name in titles}
         records = flat_records({name: result.validation_numbers[name] for name in titles})
         validation = [

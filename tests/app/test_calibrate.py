@@ -15,6 +15,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import resume, start
+from bwbayes.app.running.fingerprint import state_of
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.calibration.replicates import CalibrationSetup
 from bwbayes.errors import InputError
@@ -217,7 +218,7 @@ def test_run_is_calibrated_in_its_folder_and_its_report_says_so(
     page = (copy.calibration.path / "calibration.html").read_text(encoding="utf-8")
     assert "draws of the posterior; each record is fitted together with the run" in page
     bwbayes(*command, 2, "--seed", 4).assert_refused("copy: is a run, with its seed and folder")
-    state = bw.open_run(copy.path).state
+    state = state_of(bw.open_run(copy.path))
     for path in (copy.calibration.replicates, copy.calibration.summary):
         path.write_text(path.read_text().replace(state, "another"))
     assert bw.open_run(copy.path).calibration is None

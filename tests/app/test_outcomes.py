@@ -138,7 +138,7 @@ IN_PYTHON: dict[str, Callable[[bw.Run, Path], Any]] = {
 
 def verdict(passed: bool | None) -> BandValidation:
     cause = Finding("loop", "the operator", "try another") if passed is False else None
-    return BandValidation("held-out", training=False, passed=passed, reasons=(OFF,), cause=cause)
+    return BandValidation("held-out (held out)", False, passed, (OFF,), cause)
 
 
 @pytest.fixture(

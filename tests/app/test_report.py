@@ -83,7 +83,7 @@ def test_scores_are_shown_for_each_of_the_bands() -> None:
 
 def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
     cause = Finding("noise", "the noise is not like that", "try another noise")
-    failed = BandValidation("held-out", False, False, ("covers 60%",), cause)
+    failed = BandValidation("held-out (held out)", False, False, ("covers 60%",), cause)
     held = BandValidation("training", True, True)
     run = dataclasses.replace(example.run(), validation={"training": held, "held-out": failed})
     text = page(run)
@@ -100,7 +100,7 @@ def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
 def test_a_run_that_holds_nothing_out_says_so_on_page_and_screen(held_out: bool) -> None:
     validation = {"training": BandValidation("training", True, True)}
     if held_out:
-        validation["held-out"] = BandValidation("held-out", False, True)
+        validation["held-out"] = BandValidation("held-out (held out)", False, True)
     run = dataclasses.replace(example.run(), validation=validation)
     for text in (page(run), as_text(run_report(run, {}), 400)):
         assert held_out == ("no readings are held out: the bands are validated on" not in text)

@@ -41,7 +41,7 @@ def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) ->
     expected: style.Look = {"color": style.Color.EXPECTED, "lw": 1}
     nominal.hlines(LEVELS, x - 0.4, x + 0.4, ls="--", label="nominal", **expected)
     for i, bands in enumerate(scored):
-        color, name = style.COLORS[i % len(style.COLORS)], style.plain(style.title(bands))
+        color, name = style.COLORS[i % len(style.COLORS)], style.plain(bands.title)
         score, center = scores[bands.name], x + 0.14 * (i - (len(scored) - 1) / 2)
         # Filled markers show bands that a measurement can check, open ones need a simulation.
         for kind, shift, marker, fill in (

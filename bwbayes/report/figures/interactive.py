@@ -236,7 +236,7 @@ def _loop(bands: Bands) -> figure:
         430,
         "displacement (µm)",
         x_axis_label="voltage (V)",
-        title=style.title(bands).replace(" (", "\n("),  # a narrow plot cuts off its title
+        title=bands.title.replace(" (", "\n("),  # a narrow plot cuts off its title
         toolbar_location="above",
         styles={"flex": "1 1 240px"},
     )

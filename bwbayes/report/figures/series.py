@@ -46,7 +46,7 @@ def draw_bands(bands: Bands) -> Figure:
             panel.axvspan(*lead_in, fc=style.Color.LEAD_IN, alpha=0.35, lw=0, label=label)
     axes[2, 1].xaxis.set_major_locator(MaxNLocator(5))
     is_measured = bands.measured is not None
-    axes[0, 0].set(ylabel="voltage (V)", title=style.plain(style.title(bands)))
+    axes[0, 0].set(ylabel="voltage (V)", title=style.plain(bands.title))
     axes[1, 0].set_ylabel("displacement (µm)")
     axes[2, 0].set_ylabel("measured − mean (µm)" if is_measured else "band − mean (µm)")
     axes[0, 1].set_title(f"at the largest {'error' if is_measured else 'displacement'}")
@@ -135,7 +135,7 @@ def draw_loop(predictions: Sequence[Bands]) -> Figure:
         tip.set(xlim=(left, left + width), ylim=(bottom, bottom + height))
         outline: style.Look = {"edgecolor": style.Color.ZOOM, "alpha": 1.0, "linewidth": 1.5}
         full.indicate_inset((left, bottom, width, height), **outline)
-        full.set_title(style.plain(style.title(bands)))
+        full.set_title(style.plain(bands.title))
         tip.set_title("tip at the largest voltage")
     for panel in axes[:, 0]:
         panel.set_ylabel("displacement (µm)")

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray, IntArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.prediction.bands import Bands, Kind, title_of
+from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.report.report import label_with_unit
 
 if TYPE_CHECKING:
@@ -92,11 +92,6 @@ def axis_label(parameter: Parameter) -> str:
     except (ValueError, RuntimeError):
         symbol = plain(parameter.name)
     return label_with_unit(symbol, plain(parameter.unit))
-
-
-def title(bands: Bands) -> str:
-    """Return the title of bands: their name and kind."""
-    return title_of(bands.name, training=bands.training, separate=bands.separate)
 
 
 def time_label(offset: float) -> str:
