@@ -304,25 +304,23 @@ def _simulated(
     theta = source.prior.theta(free)
     column = source.table.columns(theta)
     simulated = {}
-    for fitted, dataset, likelihood in zip(
-        experiment.posterior.datasets, source.datasets, source.likelihoods, strict=True
-    ):
-        record_theta = source.table.of(theta, dataset.name)
+    for fitted, likelihood in zip(experiment.posterior.datasets, source.likelihoods, strict=True):
+        record_theta = source.table.of(theta, likelihood.name)
         sd = likelihood.start_sd(record_theta)
         model = likelihood.actuator.advance(
-            dataset.table.actuator(record_theta),
-            dataset.inputs,
+            likelihood.table.actuator(record_theta),
+            likelihood.inputs,
             initial_transient=sd * generator.standard_normal(sd.shape),
-            from_rest=dataset.from_rest,
+            from_rest=likelihood.from_rest,
         )[0][0]
         record = Record(
-            dataset.voltage,
+            likelihood.voltage,
             fitted.displacement,
-            interval=dataset.inputs.interval,
-            covariates=dataset.inputs.covariates,
+            interval=likelihood.inputs.interval,
+            covariates=likelihood.inputs.covariates,
         )
-        noise = dataset.table.noise(record_theta)
-        simulated[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
+        noise = likelihood.table.noise(record_theta)
+        simulated[likelihood.name] = Simulated.of(record, model, likelihood.noise, noise, generator)
     return column, simulated
 
 

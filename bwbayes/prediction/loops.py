@@ -196,12 +196,10 @@ def driven(posterior: Posterior, draws: FloatArray) -> tuple[Actuator, Values, f
     range, V, that of all.
     """
     _, single, record_draws = next(posterior.each(draws))
-    dataset = single.single_record
-    actuator = dataset.actuator.within(dataset.voltage)
-    column = dataset.table.columns(single.prior.theta(record_draws))
+    column = single.likelihood.table.columns(single.prior.theta(record_draws))
     low = min(float(np.min(record.voltage)) for record in posterior.datasets)
     high = max(float(np.max(record.voltage)) for record in posterior.datasets)
-    return actuator, column, low, high
+    return single.likelihood.actuator, column, low, high
 
 
 def steady_loop(

@@ -119,10 +119,9 @@ def measure_step(
     """
     um = (scales or Scales.exact(len(draws))).factor("um")
     _, single, record_draws = next(posterior.each(draws))
-    dataset = single.single_record
-    column = dataset.table.columns(single.prior.theta(record_draws))
+    column = single.likelihood.table.columns(single.prior.theta(record_draws))
     column |= {"initial": np.zeros(len(draws)), "offset": np.zeros(len(draws))}
-    actuator = replace(dataset.actuator.within(dataset.voltage), hold="zero")
+    actuator = replace(single.likelihood.actuator, hold="zero")
     first = 1e-6  # s: shorter than any rise
     held = max(step.held, 10 * first)
     time = np.geomspace(first, held, round(60 * np.log10(held / first)) + 1)
