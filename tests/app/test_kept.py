@@ -23,8 +23,8 @@ from bwbayes.app.fit.fitted import STAGES, open_finished
 from bwbayes.app.running import fingerprint as fingerprint_module
 from bwbayes.app.running.fingerprint import require_own, save, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.remarks import version_remarks
 from bwbayes.app.running.run import redraw, resume
+from bwbayes.app.study.about import version_remarks
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError
 from bwbayes.sampling import sampler

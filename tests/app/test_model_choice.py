@@ -22,8 +22,8 @@ from bwbayes.app.jobs.check import check
 from bwbayes.app.running import explaining
 from bwbayes.app.running.explaining import chosen_noise, search_stages
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.remarks import lines
 from bwbayes.app.running.run import resume
+from bwbayes.app.study.about import lines
 from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.diagnosis.explanations import explain, likely_causes
 from bwbayes.diagnosis.laplace import climb

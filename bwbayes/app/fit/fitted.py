@@ -432,7 +432,7 @@ class Run(Shown):
     @always
     def remarks(self, watch: Watch) -> tuple[str, ...]:
         """Return what to know of the record, the priors and the fit, one line each."""
-        from bwbayes.app.running.remarks import run_remarks
+        from bwbayes.app.study.about import run_remarks
 
         return tuple(run_remarks(self, watch))
 

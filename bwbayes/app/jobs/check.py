@@ -15,8 +15,7 @@ from markupsafe import Markup
 
 from bwbayes.app.config.config import Config
 from bwbayes.app.running.explaining import choose_model, explain_record
-from bwbayes.app.running.remarks import lines
-from bwbayes.app.study.about import findings_of
+from bwbayes.app.study.about import findings_of, lines
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.record import Record
