@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
+from bwbayes.app.study.about import findings_of
 from bwbayes.diagnosis import explanations, model, residual_analysis as scenes
 from bwbayes.diagnosis.defects import DEFECTS, LONG_DELAY
 from bwbayes.diagnosis.explanations import (
@@ -194,10 +195,13 @@ def test_a_late_column_is_named_with_its_delay_and_fitted_up_to_a_quarter_of_the
     assert abs(0.8 * float(found.text.split()[-2]) / 1000 - abs(late)) < 0.01
     assert found.rmse[1] < found.rmse[0] / 2
     assert found.spec is not None
-    fitted = judge(study.with_model(found.spec), rng)
+    delayed = study.with_model(found.spec)
+    assert not any("late" in finding.kind for finding in findings_of(delayed)["record"])
+    fitted = judge(delayed, rng)
     for name in ("d", "alpha", "beta"):
         draws = fitted.column(name)
         assert abs(np.mean(draws) - getattr(part, name)) < 3 * np.std(draws) + 0.01 * np.mean(draws)
+    assert fitted.validation["training"].passed
     assert fitted.validation["next"].passed
     assert covered(fitted.bands["next"]) > 0.85
 

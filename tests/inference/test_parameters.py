@@ -85,6 +85,16 @@ def test_parameters_and_coordinates_round_trip(name: str) -> None:
     np.testing.assert_allclose(z, prior.unconstrain(prior.constrain(z)[0]), atol=1e-5)
 
 
+def test_the_coordinate_of_a_delay_is_that_of_its_sum_with_the_lag() -> None:
+    """A record determines the sum: its posterior is straight, whatever the lag."""
+    prior = PRIORS["summed"]
+    lag, delay = (prior.free_names.index(name) for name in ("lag", "delay"))
+    lags = np.array([0.0, 1e-6, 1e-3, 4e-3])[:, np.newaxis]
+    free = np.repeat(prior.constrain(np.zeros((1, prior.dimensions)))[0], len(lags), axis=0)
+    free[:, [lag]], free[:, [delay]] = lags, -0.012 - lags
+    np.testing.assert_allclose(np.ptp(prior.unconstrain(free)[:, delay]), 0.0, atol=1e-9)
+
+
 def violations(prior: JointPrior, free: FloatArray) -> list[str]:
     v = dict(zip(prior.names, prior.theta(free).T, strict=True))
     (gamma,) = (p.declared for p in prior.parameters if p.name == "gamma")
