@@ -135,9 +135,16 @@ class _Oscillation(Defect):
 
 class _Sign(Defect):
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
-        """Yield the fit of the readings with their sign changed, if they fall with the voltage."""
+        """Yield the fit of the readings with their sign changed, if they fall with the voltage.
+
+        A delay that the model has counts: of a sine, half a period is another sign.
+        """
         record = scene.posterior.single_record
-        readings, drive = record.readings, record.voltage[record.readings.rows]
+        theta = scene.posterior.prior.theta(scene.fit.free[np.newaxis])[0].tolist()
+        values = dict(zip(scene.posterior.table.names, theta, strict=True))
+        readings, samples = record.readings, np.arange(record.voltage.size)
+        late = values.get("delay", 0.0) / scene.interval
+        drive = np.interp(readings.rows - late, samples, record.voltage)
         if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) < 0:
             turned = scene.posterior.altered(displacement=-record.displacement)
             yield Sighting(places=scene.local_minima(turned))
