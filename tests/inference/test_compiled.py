@@ -173,14 +173,14 @@ def test_what_is_compiled_beforehand_is_all_that_the_products_take(tmp_path: Pat
         posterior = short_posterior(dynamics="lag")
         kernels.compile_common()
         products(posterior.likelihoods[0], truth(posterior))
-        common = kernels._begin, kernels._one_by_one, kernels.noise.follow, kernels.displace
+        common = kernels._one_by_one, kernels.noise.follow, kernels.displace
         print(*(len(function.signatures) for function in common))
     """
     variables = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-c", script], env=variables, capture_output=True, check=True
     )
-    assert done.stdout.split() == [b"1"] * 4
+    assert done.stdout.split() == [b"1"] * 3
 
 
 def test_twin_a_defect_of_a_millionth_is_found() -> None:

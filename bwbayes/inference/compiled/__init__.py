@@ -14,9 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.compiled import kernels, lanes, whitening
-from bwbayes.inference.compiled.motion import physics, shared, simulated
-from bwbayes.inference.compiled.stages import CompiledDrive, advance_of, given, prepared
+from bwbayes.inference.compiled import kernels, whitening
+from bwbayes.inference.compiled.filter import Filter, Step
+from bwbayes.inference.compiled.kernels import Readings, Unknowns
+from bwbayes.inference.compiled.lanes import apart
+from bwbayes.inference.compiled.motion import Motion, Shared, physics, simulated
+from bwbayes.inference.compiled.stages import CompiledDrive, Given, advance_of, prepared
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.declaration import Values
@@ -56,35 +59,34 @@ def products(
     # If readings are few, a pass over all samples takes longer than whitening the readings.
     if noise.states > LANE_STATES or (is_known and 2 * readings.rows.size < readings.samples):
         return likelihood.products_of_series(theta, np.empty((0, readings.rows.size)), displacement)
-    voltage = likelihood.inputs_read.voltage
-    offset = int(likelihood.offset_sd > 0)
-    free = likelihood.unknowns - offset
+    record = Readings(likelihood.inputs_read.voltage, likelihood.values, gaps)
     column = likelihood.table.columns(theta)
-    parameters = likelihood.table.noise(theta)
-    filtering, second, steps = _filtering(noise, parameters, likelihood.readings.gaps[0])
-    slow = len(actuator.creep.times) if actuator.creep and free else 0
-    unknowns = offset, free - slow, slow
-    sums = np.empty((lanes.SUMS, len(theta)))
-    record, sections = (voltage, likelihood.values, gaps), actuator.sections(column)
+    sections, series = actuator.sections(column), 1 + likelihood.unknowns
+    steps, filtering = _filtering(noise, likelihood.table.noise(theta), readings.gaps[0])
+    unknowns, responses = _responses(likelihood, sections.recursions[0].free)
+    second = True if noise.states > 1 else None
     # A displacement that is simulated beforehand only passes the filter here.
     simulates = bool(actuator.stages) or is_known
     core, make = (actuator.linear, simulated) if simulates else (actuator, physics)
-    together = shared(core, voltage)
-    for rows, stage in _staged(likelihood, column, voltage, displacement):
+    shared = Shared.of(core, record.voltage)
+    pairs, logs = np.empty((len(theta), series, series)), np.empty(len(theta))
+    order = np.arange(series)
+    high, low = np.maximum.outer(order, order), np.minimum.outer(order, order)
+    pair = high * (high + 1) // 2 + low
+    for rows, source in _staged(likelihood, column, record.voltage, displacement):
         equilibrium = np.zeros(len(theta))
-        equilibrium[rows] = stage.equilibrium
-        named = make(actuator, sections, column, equilibrium, voltage) | filtering
-        result = kernels.sums(
-            *record, lanes.in_lanes(lanes.by_rows(named)[rows]), _over_gaps(steps[rows]), second,
-            stage.kind, lanes.in_lanes(stage.group), stage.plan, *together, *unknowns,
-        )  # fmt: skip
-        sums[:, rows] = result[:, : len(stage.group)]
-    size = 1 + offset + free
-    pairs = np.empty((len(theta), size, size))
-    i, j = np.tril_indices(size)
-    pairs[:, i, j] = pairs[:, j, i] = sums[: i.size].T
-    typical = readings.rows.size * np.log(filtering["q_11"] + filtering["sensor"])
-    return pairs, typical + sums[lanes.LOG_DETERMINANT]
+        equilibrium[rows] = source.models.equilibrium
+        named = make(actuator, sections, column, equilibrium, record.voltage)
+        over = Step.filled(steps, rows, readings.gaps[0].size)
+        filters = Filter.filled(filtering | responses, rows)
+        filters["step"] = over[:, 0]
+        motions = Motion.filled(named, rows)
+        kernels.sums(record, *source, shared, motions, filters, over, second, unknowns)
+        models = source.models.equilibrium.size
+        pairs[rows] = apart(filters["products"], models)[:, pair]
+        logs[rows] = apart(filters["log"], models)
+    typical = readings.rows.size * np.log(steps["q_11"][:, 0] + filtering["sensor"])
+    return pairs, typical + logs
 
 
 def whiten(
@@ -111,15 +113,12 @@ def whiten(
 
 def _filtering(
     noise: Noise, theta: FloatArray, missing: FloatArray
-) -> tuple[dict[str, FloatArray], bool | None, FloatArray]:
-    """Return the filter's usual step and the variances, (models,), by the names of ``PARAMETERS``.
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Return the filter's steps (models, gaps), and its start (models,), by rows.
 
-    Also returns whether there is a second state, None for no, which leaves it out of the compiled
-    code, and the steps over all gaps but the first, which misses no reading, side by side (models,
-    gaps times rows).
-
-    The lanes observe the first of two states alone, whose stationary covariance is a multiple of
-    the unit matrix: other states x are turned into T x.
+    The first step, for no missing reading, is from one to the next; others are those over what is
+    missing. The lanes observe the first of two states alone, whose stationary covariance is a
+    multiple of the unit matrix: other states x are turned into T x.
     """
     stationary, observe, states = noise.stationary(theta), noise.observe, noise.states
     variance = observe @ stationary @ observe
@@ -127,26 +126,39 @@ def _filtering(
         stationary, variance[:, np.newaxis, np.newaxis] * np.eye(states)
     )
     turned = None if plain else _observed_first(stationary, observe)
+    size = max(states, 1)
+    f_matrices, gained = np.zeros((2, len(theta), missing.size, size, size))
+    for gap, number in enumerate([1.0, *missing[1:].tolist()] if states else []):
+        f, q = _step(noise, theta, number)
+        if turned is not None:
+            f = turned @ f @ np.linalg.inv(turned)
+            q = turned @ q @ np.swapaxes(turned, 1, 2)
+        f_matrices[:, gap], gained[:, gap] = f, q
+    steps = {}
+    for i, j in np.ndindex(size, size):
+        steps[f"f_{i + 1}{j + 1}"] = f_matrices[..., i, j]
+        if i <= j:
+            steps[f"q_{i + 1}{j + 1}"] = gained[..., i, j]
+    return steps, {
+        "sensor": theta[:, 0] ** 2, "covariance": variance, "covariance_22": variance,
+        "ratio": np.ones(len(theta)), "change": np.full(len(theta), np.inf),
+    }  # fmt: skip
 
-    def rows(readings: float) -> FloatArray:
-        """Return the rows of a step over so many readings, (STEP, models)."""
-        values = np.zeros((lanes.STEP, len(theta)))
-        if states:
-            f_matrices, gained = _step(noise, theta, readings)
-            if turned is not None:
-                f_matrices = turned @ f_matrices @ np.linalg.inv(turned)
-                gained = turned @ gained @ np.swapaxes(turned, 1, 2)
-            wide = np.zeros((2, len(theta), 2, 2))
-            wide[0, :, :states, :states], wide[1, :, :states, :states] = f_matrices, gained
-            values[:4] = wide[0].reshape(-1, 4).T
-            values[4:] = wide[1, :, [0, 0, 1], [0, 1, 1]]
-        return values
 
-    named = dict(zip(lanes.PARAMETERS[lanes.F // lanes.LANES :], rows(1.0), strict=False))
-    named["stationary"], named["sensor"] = variance, theta[:, 0] ** 2
-    steps = [rows(number) for number in missing[1:].tolist()]
-    over = np.concatenate([np.empty((0, len(theta))), *steps]).T
-    return named, True if states > 1 else None, over
+def _responses(likelihood: Likelihood, free: FloatArray) -> tuple[Unknowns, dict[str, FloatArray]]:
+    """Return the numbers of unknowns, and the start of all series (models, series), by rows.
+
+    ``free`` (models, unknowns, taps) are the dynamics' free responses.
+    """
+    offset, creep = int(likelihood.offset_sd > 0), likelihood.actuator.creep
+    moving = likelihood.unknowns - offset
+    slow = len(creep.times) if creep and moving else 0
+    starts = np.zeros((2, len(free), 1 + likelihood.unknowns))
+    starts[0, :, 1:] = 1.0
+    if moving > slow:
+        own = slice(1 + offset, 1 + offset + moving - slow)
+        starts[: free.shape[2], :, own] = np.moveaxis(free, 2, 0)
+    return Unknowns(offset, moving - slow, slow), {"response": starts[0], "response_2": starts[1]}
 
 
 def _observed_first(stationary: FloatArray, observe: FloatArray) -> FloatArray:
@@ -171,12 +183,6 @@ def _step(noise: Noise, theta: FloatArray, readings: float) -> tuple[FloatArray,
     return noise.transition(theta, readings), noise.process_covariance(theta, readings)
 
 
-def _over_gaps(steps: FloatArray) -> FloatArray:
-    """Put steps over gaps side by side, (groups, gaps, rows times lanes)."""
-    groups = lanes.in_lanes(steps)
-    return groups.reshape(len(groups), -1, lanes.STEP * lanes.LANES)
-
-
 def _staged(
     likelihood: Likelihood, column: Values, voltage: FloatArray, displacement: FloatArray | None
 ) -> Iterator[tuple[IntArray | slice, CompiledDrive]]:
@@ -188,12 +194,13 @@ def _staged(
     if displacement is not None:
         moved = np.zeros((len(displacement), voltage.size))
         moved[:, likelihood.readings.where] = displacement
-        yield slice(None), given(moved, column["offset"].size)
+        yield slice(None), CompiledDrive(None, Given.of(moved, column["offset"].size))
         return
     if actuator.stages:
         theta = np.stack([column[name] for name in actuator.parameters], axis=1)
         for batch in batches(len(theta), voltage.size):
-            yield batch, given(likelihood.simulate(theta[batch], likelihood.inputs_read))
+            moved = likelihood.simulate(theta[batch], likelihood.inputs_read)
+            yield batch, CompiledDrive(None, Given.of(moved))
         return
     operator, others = actuator.hysteresis, np.arange(column["offset"].size)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
@@ -206,4 +213,5 @@ def _staged(
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
         values = {name: column[name][rows] for name in actuator.parameters}
         memory = actuator.begin(values, voltage, from_rest=from_rest)
-        yield rows, given(advance_of(operator)(operator, values, voltage, memory)[0])
+        drive, _ = advance_of(operator)(operator, values, voltage, memory)
+        yield rows, CompiledDrive(None, Given.of(drive))

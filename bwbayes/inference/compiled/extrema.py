@@ -7,32 +7,45 @@ are worked out together.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled.caching import compile_cached
-from bwbayes.inference.compiled.lanes import LANES
+from bwbayes.inference.compiled.lanes import LANES, repeat_last
 from bwbayes.model.compiled import formula
 from bwbayes.model.operators.extremum_memory import Memory, RemembersExtrema
 
-# Rows: a model's number in the plan, w₀, w of the last sample, the direction, the number of
-# extrema; then the voltages of the extrema, and the displacements there.
-FIXED = 5
-NUMBER, REST, LAST, SIGN, DEPTH, STACK = (LANES * row for row in range(FIXED + 1))
 
+class Branches(NamedTuple):
+    """Numbers and memory of models.
 
-def rows(voltage: FloatArray, memory: Memory) -> FloatArray:
-    """Return the stage's initial rows, (models, rows), with w₀ second; its plan are the numbers."""
-    models, extrema = memory.displacement.size, memory.extrema
-    slots = deepest(voltage, np.array([extremum.voltage for extremum in extrema]), memory.direction)
-    group = np.zeros((models, FIXED + 2 * slots))
-    group[:, 0] = np.arange(models)
-    group[:, 1] = group[:, 2] = memory.displacement
-    group[:, 3], group[:, 4] = memory.direction, len(extrema)
-    for slot, (level, displacement, voltage_of_model) in enumerate(extrema, FIXED):
-        group[:, slot] = level if voltage_of_model is None else voltage_of_model
-        group[:, slots + slot] = displacement
-    return group
+    ``numbers`` (models, any) are those of the operator; (models,) are w₀, w of the last sample, um,
+    its direction and the number of extrema in memory; (models, extrema) their voltages, V, and the
+    displacements there, um.
+    """
+
+    numbers: FloatArray
+    equilibrium: FloatArray
+    last: FloatArray
+    direction: FloatArray
+    depth: IntArray
+    voltages: FloatArray
+    displacements: FloatArray
+
+    @classmethod
+    def of(cls, numbers: FloatArray, voltage: FloatArray, memory: Memory) -> Branches:
+        """Return the models at the first sample of a voltage."""
+        models, extrema = memory.displacement.size, memory.extrema
+        levels = np.array([extremum.voltage for extremum in extrema])
+        stacks = np.zeros((2, models, deepest(voltage, levels, memory.direction)))
+        for slot, (level, displacement, voltage_of_model) in enumerate(extrema):
+            stacks[0, :, slot] = level if voltage_of_model is None else voltage_of_model
+            stacks[1, :, slot] = displacement
+        direction, depth = np.full(models, memory.direction), np.full(models, len(extrema))
+        start = memory.displacement
+        return cls(numbers, start, start.copy(), direction, depth, *stacks)
 
 
 @compile_cached()
@@ -93,20 +106,21 @@ def _ends(voltage: FloatArray, first: int, last: int) -> IntArray:
 @compile_cached()
 def along_branches(
     operator: RemembersExtrema,
-    group: FloatArray,
-    plan: FloatArray,
+    models: Branches,
+    group: int,
     voltage: FloatArray,
     first: int,
-    last: int,
     out: FloatArray,
 ) -> None:
-    """Write w − w₀ of samples ``first`` to ``last`` to ``out`` and move the memory on."""
-    slots = (group.size // LANES - FIXED) // 2
-    w, ends = np.empty(last - first), _ends(voltage, first, last)
-    for i in range(LANES):
-        numbers, stack = plan[int(group[NUMBER + i])], group[STACK + i :: LANES]
-        here, direction, depth = group[LAST + i], group[SIGN + i], int(group[DEPTH + i])
-        begin = first
+    """Write w − w₀ of samples from ``first`` on to ``out`` (samples, lanes); advance the memory."""
+    last = first + len(out)
+    w, ends = np.empty(len(out)), _ends(voltage, first, last)
+    count = min(LANES, models.equilibrium.size - group * LANES)
+    for i in range(count):
+        model = group * LANES + i
+        voltages, displacements = models.voltages[model], models.displacements[model]
+        here, direction = models.last[model], models.direction[model]
+        depth, begin = models.depth[model], first
         while begin < last:
             before, u = voltage[max(begin - 1, 0)], voltage[begin]
             s = np.sign(u - before)
@@ -115,22 +129,26 @@ def along_branches(
                 begin += 1
                 continue
             if s == -direction:
-                stack[depth], stack[slots + depth] = before, here
+                voltages[depth], displacements[depth] = before, here
                 depth += 1
             direction = s
-            depth = _remaining(stack, depth, s, u)
-            closing, end = _closing(stack, depth, s), ends[begin - first]
+            depth = _remaining(voltages, depth, s, u)
+            closing, end = _closing(voltages, depth, s), ends[begin - first]
             if s * voltage[end - 1] >= closing:
                 end = begin + 1
                 while s * voltage[end] < closing:
                     end += 1
-            turned, level = stack[depth - 1], stack[slots + depth - 1]
+            turned, level = voltages[depth - 1], displacements[depth - 1]
             branch = w[begin - first : end - first]
-            _branch(operator, numbers, turned, level, s, depth, voltage[begin:end], branch)
+            _branch(
+                operator, models.numbers[model], turned, level, s, depth,
+                voltage[begin:end], branch,
+            )  # fmt: skip
             here, begin = branch[-1], end
-        group[LAST + i], group[SIGN + i], group[DEPTH + i] = here, direction, depth
-        for t in range(last - first):
-            out[t * LANES + i] = w[t] - group[REST + i]
+        models.last[model], models.direction[model], models.depth[model] = here, direction, depth
+        for t in range(len(out)):
+            out[t, i] = w[t] - models.equilibrium[model]
+    repeat_last(count, out)
 
 
 @compile_cached(error_model="numpy", fastmath={"contract", "nsz"})

@@ -14,25 +14,67 @@ filter.
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.compiled.lanes import LANES, Row, Struct, Structs, inner
+from bwbayes.model.linear import MOST_TIMES
 
-# isort: off
-# fmt: off
-from bwbayes.inference.compiled.lanes import (
-    CHANGE, COVARIANCE, COVARIANCE_12, COVARIANCE_22, ESTIMATE, ESTIMATE_2, F, F_12, F_21, F_22,
-    GAIN, GAIN_2, GAP, INNOVATION, INVERSE, LANES, LATEST, LOG, PRODUCTS, Q, RATIO, RESPONSE,
-    SENSOR, SQUARES, VALUE, inner,
-)
-# fmt: on
-# isort: on
+# The series that are filtered: the residual, the record's own offset, two free responses of the
+# dynamics, those of the creep.
+SERIES = 4 + MOST_TIMES
+
+Each = Annotated[FloatArray, (SERIES,)]
+
+
+class Step(Struct):
+    """The filter's step from a reading to the next: F and Q."""
+
+    f_11: Row
+    f_12: Row
+    f_21: Row
+    f_22: Row
+    q_11: Row
+    q_12: Row
+    q_22: Row
+
+
+class Filter(Struct):
+    """Numbers and memory of the filter.
+
+    Each series has a value, estimates of both states of the noise and an innovation; a response
+    also has the two numbers of its recursion. ``products`` are sums of products of innovations over
+    their variances, of pairs i ≥ j of series; ``log`` is the sum of the variances' logarithms, less
+    those of Q₁₁ + s².
+    """
+
+    step: Step
+    sensor: Row
+    covariance: Row
+    covariance_12: Row
+    covariance_22: Row
+    change: Row
+    gain: Row
+    gain_2: Row
+    inverse: Row
+    ratio: Row
+    log: Row
+    squares: Row
+    latest: Row
+    value: Each
+    estimate: Each
+    estimate_2: Each
+    innovation: Each
+    response: Each
+    response_2: Each
+    products: Annotated[FloatArray, (SERIES * (SERIES + 1) // 2,)]
 
 
 @inner(fastmath={"contract", "nsz"})
 def follow(
-    state: FloatArray,
+    state: Filter,
     second: bool | None,
     readings: FloatArray,
     displacement: FloatArray,
@@ -41,38 +83,36 @@ def follow(
 ) -> None:
     """Advance a settled filter along complete readings (samples,).
 
-    ``displacement`` is that of the models. ``decays`` is ρ of each response that still matters, and
-    ``series`` are their indices: as their innovations are in proportion to them, only Σ ρᵗ η of the
-    residual's innovations η has to be added up.
+    ``displacement`` (samples, lanes) is that of the models. ``decays`` is ρ of each response that
+    still matters, and ``series`` are their indices: as their innovations are in proportion to them,
+    only Σ ρᵗ η of the residual's innovations η has to be added up.
     """
+    step, gain, gain_2, innovations = state.step, state.gain, state.gain_2, state.innovation
+    estimate, estimate_2 = state.estimate[0], state.estimate_2[0]
+    f_11, f_12, f_21, f_22 = step.f_11, step.f_12, step.f_21, step.f_22
+    squares, latest = state.squares, state.latest
     count = series.size
     for k in range(count):
         for i in range(LANES):
-            state[INNOVATION + series[k] * LANES + i] = 0.0
+            innovations[series[k], i] = 0.0
     weight = np.ones(count)
     for t in range(readings.size):
-        y, row = readings[t], t * LANES
+        y = readings[t]
         for i in range(LANES):
-            estimate = state[ESTIMATE + i]
-            innovation = y - displacement[row + i] - estimate
+            before = estimate[i]
+            innovation = y - displacement[t, i] - before
             if second is None:
-                state[ESTIMATE + i] = state[F + i] * estimate + state[GAIN + i] * innovation
+                estimate[i] = f_11[i] * before + gain[i] * innovation
             else:
-                other = state[ESTIMATE_2 + i]
-                state[ESTIMATE + i] = (
-                    state[F + i] * estimate + state[F_12 + i] * other + state[GAIN + i] * innovation
-                )
-                state[ESTIMATE_2 + i] = (
-                    state[F_22 + i] * other
-                    + state[F_21 + i] * estimate
-                    + state[GAIN_2 + i] * innovation
-                )
-            state[SQUARES + i] += innovation * innovation
-            state[LATEST + i] = innovation
+                other = estimate_2[i]
+                estimate[i] = f_11[i] * before + f_12[i] * other + gain[i] * innovation
+                estimate_2[i] = f_22[i] * other + f_21[i] * before + gain_2[i] * innovation
+            squares[i] += innovation * innovation
+            latest[i] = innovation
         for k in range(count):
-            factor, at = weight[k], INNOVATION + series[k] * LANES
+            factor, total = weight[k], innovations[series[k]]
             for i in range(LANES):
-                state[at + i] += factor * state[LATEST + i]
+                total[i] += factor * latest[i]
             weight[k] *= decays[k]
     if count:
         _fold(state, second, readings.size, weight, decays, series)
@@ -80,7 +120,7 @@ def follow(
 
 @inner(error_model="numpy")
 def _fold(
-    state: FloatArray,
+    state: Filter,
     second: bool | None,
     samples: int,
     weight: FloatArray,
@@ -92,60 +132,57 @@ def _fold(
     ``weight`` is the part of each response that remains after them; products of two are geometric
     sums.
     """
+    value, response, inverse = state.value, state.response, state.inverse
     count = series.size
     for k in range(count):
-        at, rho = series[k] * LANES, decays[k]
+        at, rho = series[k], decays[k]
         for i in range(LANES):
             share, _ = _parts(state, second, i, rho)
-            state[VALUE + at + i] = state[RESPONSE + at + i] * (1.0 - share)
-        row = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
+            value[at, i] = response[at, i] * (1.0 - share)
+        row = at * (at + 1) // 2
         for i in range(LANES):
-            pull = state[VALUE + at + i] * state[INNOVATION + at + i]
-            state[row + i] += pull * state[INVERSE + i]
+            pull = value[at, i] * state.innovation[at, i]
+            state.products[row, i] += pull * inverse[i]
         for j in range(k + 1):
-            other, product = series[j] * LANES, rho * decays[j]
+            other, product = series[j], rho * decays[j]
             total = float(samples)
             if product < 1.0:
                 total = (1.0 - weight[k] * weight[j]) / (1.0 - product)
             for i in range(LANES):
-                cross_product = state[VALUE + at + i] * state[VALUE + other + i]
-                state[row + other + i] += cross_product * total * state[INVERSE + i]
+                cross_product = value[at, i] * value[other, i]
+                state.products[row + other, i] += cross_product * total * inverse[i]
     for k in range(count):
-        at = series[k] * LANES
+        at = series[k]
         for i in range(LANES):
-            response = state[RESPONSE + at + i] * weight[k]
-            state[RESPONSE + at + i] = response
+            response[at, i] *= weight[k]
             share, part_2 = _parts(state, second, i, decays[k])
-            state[ESTIMATE + at + i], state[ESTIMATE_2 + at + i] = (
-                response * share,
-                response * part_2,
-            )
+            state.estimate[at, i] = response[at, i] * share
+            state.estimate_2[at, i] = response[at, i] * part_2
 
 
 @inner(error_model="numpy")
-def _parts(state: FloatArray, second: bool | None, i: int, rho: float) -> tuple[float, float]:
+def _parts(state: Filter, second: bool | None, i: int, rho: float) -> tuple[float, float]:
     """Return c and c₂, the ratios of both estimates to a response that keeps ρ of itself."""
-    gain, first = float(state[GAIN + i]), rho - state[F + i]
+    step = state.step
+    gain, first = float(state.gain[i]), rho - step.f_11[i]
     if second is None:
         return gain / (first + gain), 0.0
-    gain_2, last = state[GAIN_2 + i], rho - state[F_22 + i]
-    f_12, f_21 = state[F_12 + i], state[F_21 + i]
+    gain_2, last = state.gain_2[i], rho - step.f_22[i]
+    f_12, f_21 = step.f_12[i], step.f_21[i]
     total = (first + gain) * last + f_12 * (gain_2 - f_21)
     return (gain * last + f_12 * gain_2) / total, (first * gain_2 + f_21 * gain) / total
 
 
 @inner(error_model="numpy")
-def is_tracked(
-    state: FloatArray, second: bool | None, decays: FloatArray, series: IntArray
-) -> bool:
+def is_tracked(state: Filter, second: bool | None, decays: FloatArray, series: IntArray) -> bool:
     """Tell whether the estimates of all these responses are proportional to them, to rounding."""
     for k in range(series.size):
-        at = series[k] * LANES
+        at = series[k]
         for i in range(LANES):
-            response = state[RESPONSE + at + i]
+            response = state.response[at, i]
             share, part_2 = _parts(state, second, i, decays[k])
-            gap = abs(state[ESTIMATE + at + i] - response * share)
-            gap_2 = abs(state[ESTIMATE_2 + at + i] - response * part_2) / (1.0 + abs(part_2))
+            gap = abs(state.estimate[at, i] - response * share)
+            gap_2 = abs(state.estimate_2[at, i] - response * part_2) / (1.0 + abs(part_2))
             size = 1e-13 * abs(response)
             if not (gap <= size and gap_2 <= size):
                 return False
@@ -153,20 +190,39 @@ def is_tracked(
 
 
 @inner()
-def is_settled(state: FloatArray) -> bool:
+def is_heard(state: Filter, series: int) -> bool:
+    """Tell whether the unknown initial state still matters to any model in one of its series.
+
+    A response below 10⁻¹⁸ of its initial size adds nothing. A response that no longer matters is
+    set to zero: numbers that decay for ever become subnormal, with which a processor takes ten
+    times as long.
+    """
+    response, response_2 = state.response[series], state.response_2[series]
+    estimate, estimate_2 = state.estimate[series], state.estimate_2[series]
+    heard = False
+    for i in range(LANES):
+        if max(abs(response[i]), abs(response_2[i]), abs(estimate[i]), abs(estimate_2[i])) > 1e-18:
+            heard = True
+        else:
+            response[i] = response_2[i] = estimate[i] = estimate_2[i] = 0.0
+    return heard
+
+
+@inner()
+def is_settled(state: Filter) -> bool:
     """Tell whether the last reading changed no model's covariance, except for rounding."""
     settled = True
     for i in range(LANES):
-        settled &= state[CHANGE + i] <= 2e-15 * state[COVARIANCE + i]
+        settled &= state.change[i] <= 2e-15 * state.covariance[i]
     return settled
 
 
 @inner(error_model="numpy")
 def gain(
-    state: FloatArray,
+    state: Filter,
     second: bool | None,
     gaps: IntArray,
-    steps: FloatArray,
+    steps: Structs,
     gains: FloatArray,
     gains_2: FloatArray,
     inverse: FloatArray,
@@ -174,23 +230,19 @@ def gain(
     """Advance the covariance along samples (samples,); write both gains and 1/variance of each.
 
     ``gaps`` and ``steps`` are as in :func:`bwbayes.inference.compiled.kernels.sums`, the others
-    (samples times lanes,). Where there is no reading, nothing is written.
+    (samples, lanes). Where there is no reading, nothing is written.
     """
     for t in range(gaps.size):
         if gaps[t] > 0:
-            # Predict over the missing readings by the filter's step over this gap.
-            over = steps[gaps[t] - 1]
+            # Predict over the missing readings.
             _take_logs(state)
-            for i in range(over.size):
-                state[GAP + i] = over[i]
-            _predict(state, second, GAP)
+            _predict(state, second, steps[gaps[t]])
         if gaps[t] >= 0:
             _advance(state, second)
-            row = t * LANES
             for i in range(LANES):
-                gains[row + i] = state[GAIN + i]
-                gains_2[row + i] = state[GAIN_2 + i]
-                inverse[row + i] = state[INVERSE + i]
+                gains[t, i] = state.gain[i]
+                gains_2[t, i] = state.gain_2[i]
+                inverse[t, i] = state.inverse[i]
     _take_logs(state)
 
 
@@ -198,105 +250,104 @@ def gain(
 def innovate(
     second: bool | None,
     gaps: IntArray,
-    steps: FloatArray,
-    step: FloatArray,
+    steps: Structs,
     gains: FloatArray,
     gains_2: FloatArray,
     estimate: FloatArray,
     other: FloatArray,
     values: FloatArray,
 ) -> None:
-    """Turn a series' values, (samples times lanes,), into innovations, 0 without a reading.
+    """Turn a series' values, (samples, lanes), into innovations, 0 without a reading.
 
-    ``step`` is the filter's step from reading to reading, ``estimate`` and ``other`` (lanes,) are
-    its estimates of both states of the noise. All arrays are separate, so that a compiler may take
-    several lanes at once.
+    ``estimate`` and ``other`` (lanes,) are its estimates of both states of the noise.
     """
+    step = steps[0]
     for t in range(gaps.size):
-        row = t * LANES
         if gaps[t] > 0:
-            over = steps[gaps[t] - 1]
+            over = steps[gaps[t]]
             for i in range(LANES):
                 before = estimate[i]
-                estimate[i] = over[i] * before
+                estimate[i] = over.f_11[i] * before
                 if second is not None:
-                    estimate[i] += over[LANES + i] * other[i]
-                    other[i] = over[3 * LANES + i] * other[i] + over[2 * LANES + i] * before
+                    estimate[i] += over.f_12[i] * other[i]
+                    other[i] = over.f_22[i] * other[i] + over.f_21[i] * before
         if gaps[t] < 0:
             for i in range(LANES):
-                values[row + i] = 0.0
+                values[t, i] = 0.0
         else:
             for i in range(LANES):
                 before = estimate[i]
-                innovation = values[row + i] - before
-                values[row + i] = innovation
-                estimate[i] = step[i] * before + gains[row + i] * innovation
+                innovation = values[t, i] - before
+                values[t, i] = innovation
+                estimate[i] = step.f_11[i] * before + gains[t, i] * innovation
                 if second is not None:
-                    estimate[i] += step[LANES + i] * other[i]
-                    other[i] = step[3 * LANES + i] * other[i] + step[2 * LANES + i] * before
-                    other[i] += gains_2[row + i] * innovation
+                    estimate[i] += step.f_12[i] * other[i]
+                    other[i] = step.f_22[i] * other[i] + step.f_21[i] * before
+                    other[i] += gains_2[t, i] * innovation
 
 
 @inner(error_model="numpy")
-def _advance(state: FloatArray, second: bool | None) -> None:
+def _advance(state: Filter, second: bool | None) -> None:
     """Advance the covariance to the next reading, and write the gain of this one."""
+    step, sensors, change = state.step, state.sensor, state.change
+    covariance, covariance_12 = state.covariance, state.covariance_12
     for i in range(LANES):
-        p, sensor = state[COVARIANCE + i], state[SENSOR + i]
+        p, sensor = covariance[i], sensors[i]
         variance = p + sensor
         inverse = 1.0 / variance
-        state[INVERSE + i] = inverse
-        state[RATIO + i] *= variance / (state[Q + i] + sensor)
+        state.inverse[i] = inverse
+        state.ratio[i] *= variance / (step.q_11[i] + sensor)
         if second is None:
-            state[GAIN + i] = state[F + i] * (p * inverse)
-            state[COVARIANCE + i] = p * (sensor * inverse)
+            state.gain[i] = step.f_11[i] * (p * inverse)
+            covariance[i] = p * (sensor * inverse)
         else:
-            across, remainder = state[COVARIANCE_12 + i], sensor * inverse
+            across, remainder = covariance_12[i], sensor * inverse
             g, g_2 = p * inverse, across * inverse
-            state[GAIN + i] = state[F + i] * g + state[F_12 + i] * g_2
-            state[GAIN_2 + i] = state[F_22 + i] * g_2 + state[F_21 + i] * g
-            state[COVARIANCE + i], state[COVARIANCE_12 + i] = p * remainder, across * remainder
-            state[COVARIANCE_22 + i] -= across * g_2
+            state.gain[i] = step.f_11[i] * g + step.f_12[i] * g_2
+            state.gain_2[i] = step.f_22[i] * g_2 + step.f_21[i] * g
+            covariance[i], covariance_12[i] = p * remainder, across * remainder
+            state.covariance_22[i] -= across * g_2
         # Keep the former covariance for a comparison.
-        state[CHANGE + i] = p
-    _predict(state, second, F)
+        change[i] = p
+    _predict(state, second, step)
     for i in range(LANES):
-        state[CHANGE + i] = abs(state[COVARIANCE + i] - state[CHANGE + i])
+        change[i] = abs(covariance[i] - change[i])
 
 
 @inner(error_model="numpy")
-def _predict(state: FloatArray, second: bool | None, step: int) -> None:
-    """Advance the covariance by a step, whose rows begin at ``step``."""
+def _predict(state: Filter, second: bool | None, step: Step) -> None:
+    """Advance the covariance by a step."""
+    covariance, covariance_12 = state.covariance, state.covariance_12
+    covariance_22 = state.covariance_22
     for i in range(LANES):
-        a, p = state[step + i], state[COVARIANCE + i]
-        gained = state[step + 4 * LANES + i]
+        a, p, gained = step.f_11[i], covariance[i], step.q_11[i]
         if second is None:
-            state[COVARIANCE + i] = a * a * p + gained
+            covariance[i] = a * a * p + gained
         else:
-            b, c = state[step + LANES + i], state[step + 2 * LANES + i]
-            d = state[step + 3 * LANES + i]
-            p_12, p_22 = state[COVARIANCE_12 + i], state[COVARIANCE_22 + i]
+            b, c, d = step.f_12[i], step.f_21[i], step.f_22[i]
+            p_12, p_22 = covariance_12[i], covariance_22[i]
             top, bottom = a * p + b * p_12, a * p_12 + b * p_22
             low, end = d * p_12 + c * p, d * p_22 + c * p_12
-            state[COVARIANCE + i] = a * top + b * bottom + gained
-            state[COVARIANCE_12 + i] = d * bottom + c * top + state[step + 5 * LANES + i]
-            state[COVARIANCE_22 + i] = d * end + c * low + state[step + 6 * LANES + i]
+            covariance[i] = a * top + b * bottom + gained
+            covariance_12[i] = d * bottom + c * top + step.q_12[i]
+            covariance_22[i] = d * end + c * low + step.q_22[i]
 
 
 @inner()
-def _take_logs(state: FloatArray) -> None:
+def _take_logs(state: Filter) -> None:
     """Move the product of variances to the sum of logs, before it gets too large."""
     for i in range(LANES):
-        state[LOG + i] += math.log(state[RATIO + i])
-        state[RATIO + i] = 1.0
+        state.log[i] += math.log(state.ratio[i])
+        state.ratio[i] = 1.0
 
 
 @inner()
-def gather(state: FloatArray, readings: int) -> None:
+def gather(state: Filter, readings: int) -> None:
     """Add the contributions of so many readings with one variance to the sums."""
     if readings == 0:
         return
     for i in range(LANES):
-        state[PRODUCTS + i] += state[SQUARES + i] * state[INVERSE + i]
-        state[SQUARES + i] = 0.0
-        typical = state[Q + i] + state[SENSOR + i]
-        state[LOG + i] -= readings * math.log(state[INVERSE + i] * typical)
+        state.products[0, i] += state.squares[i] * state.inverse[i]
+        state.squares[i] = 0.0
+        typical = state.step.q_11[i] + state.sensor[i]
+        state.log[i] -= readings * math.log(state.inverse[i] * typical)

@@ -7,40 +7,67 @@ at rest.
 
 from __future__ import annotations
 
+from typing import Annotated, NamedTuple
+
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-
-# isort: off
-# fmt: off
-from bwbayes.inference.compiled.lanes import (
-    A1, A2, B0, B1, B2, CREPT, CUBIC, EQUILIBRIUM, GROWTH, LAG, LANES, LEVEL, QUADRATIC,
-    STRENGTH, X1, X2, inner,
-)
-# fmt: on
-# isort: on
+from bwbayes.inference.compiled.lanes import LANES, Row, Struct, inner
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
-from bwbayes.model.linear import Sections
+from bwbayes.model.linear import MOST_TIMES, Sections
 
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
 
+Times = Annotated[FloatArray, (MOST_TIMES,)]
 
-def shared(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the arguments of :func:`displace` for nonlinearity and creep that all models share."""
-    curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.zeros(voltage.size)
-    if actuator.nonlinearity is not None:
-        x = actuator.nonlinearity.scaled(voltage)
-        curve = np.stack([x**2 - x[0] ** 2, x**3 - x[0] ** 3], axis=1)
-    if actuator.creep is not None:
-        recursions = actuator.creep.recursions(1, actuator.interval, actuator.hold)
-        lags = np.array(
-            [[*recursion.numerator[0], -recursion.denominator[0, 1]] for recursion in recursions]
-        )
-        if actuator.creep.growing:
-            growth = actuator.creep.size(voltage)
-    return curve, lags, growth
+
+class Motion(Struct):
+    """Numbers and memory of nonlinearity, dynamics and creep."""
+
+    level: Row
+    quadratic: Row
+    cubic: Row
+    b0: Row
+    b1: Row
+    b2: Row
+    a1: Row
+    a2: Row
+    x1: Row
+    x2: Row
+    equilibrium: Row
+    crept: Row
+    growth: Row
+    strength: Times
+    lag: Times
+
+
+class Shared(NamedTuple):
+    """Constants of nonlinearity and creep that all models share.
+
+    ``curve`` (samples, 2) holds x² − x₀² and x³ − x₀³ of the nonlinearity, or is empty; ``lags``
+    (times, 3) holds each lag's two coefficients of the drive and the part that it keeps of itself;
+    ``growth`` (samples,) is |u| / U, or zero.
+    """
+
+    curve: FloatArray
+    lags: FloatArray
+    growth: FloatArray
+
+    @classmethod
+    def of(cls, actuator: Actuator, voltage: FloatArray) -> Shared:
+        """Return the constants of an actuator along a voltage."""
+        curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.zeros(voltage.size)
+        if actuator.nonlinearity is not None:
+            x = actuator.nonlinearity.scaled(voltage)
+            curve = np.stack([x**2 - x[0] ** 2, x**3 - x[0] ** 3], axis=1)
+        if actuator.creep is not None:
+            recursions = actuator.creep.recursions(1, actuator.interval, actuator.hold)
+            lags = np.array([[*one.numerator[0], -one.denominator[0, 1]] for one in recursions])
+            if actuator.creep.growing:
+                growth = actuator.creep.size(voltage)
+        return cls(curve, lags, growth)
 
 
 def physics(
@@ -50,7 +77,7 @@ def physics(
     equilibrium: FloatArray,
     voltage: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Return the numbers of models (models,) without a noise, by the names of ``PARAMETERS``.
+    """Return the numbers of models (models, ...) by the rows of :class:`Motion`.
 
     ``sections`` are the actuator's; ``equilibrium`` (models,) is w₀ without nonlinearity, um.
     """
@@ -60,13 +87,10 @@ def physics(
     if actuator.creep is not None:
         crept = actuator.creep.drive(column, equilibrium[:, np.newaxis], voltage[:1])[:, 0]
         level = level + crept * np.sum(sections.gains[1:], axis=0)
-        rows |= {"crept": crept}
+        rows |= {"crept": crept, "strength": np.stack(sections.gains[1:], axis=1)}
     dynamics = sections.recursions[0]
     rows |= dict(zip(("b0", "b1", "b2"), dynamics.numerator.T, strict=False))
     rows |= dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
-    for unknown, tap in np.ndindex(dynamics.free.shape[1:]):
-        rows[f"free_{unknown + 1}{tap + 1}"] = dynamics.free[:, unknown, tap]
-    rows |= {f"strength_{k}": gain for k, gain in enumerate(sections.gains[1:], 1)}
     rows |= {"level": level}
     others = {"growth": "creep_growth", "quadratic": "quadratic", "cubic": "cubic"}
     return rows | {row: column[name] for row, name in others.items() if name in column}
@@ -86,82 +110,57 @@ def simulated(
     """
     dynamics, rows = sections.recursions[0], {"level": first, "b0": np.ones_like(first)}
     rows |= dict(zip(("b1", "b2"), dynamics.denominator.T[1:], strict=False))
-    rows |= dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
-    for unknown, tap in np.ndindex(dynamics.free.shape[1:]):
-        rows[f"free_{unknown + 1}{tap + 1}"] = dynamics.free[:, unknown, tap]
-    return rows
+    return rows | dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
 
 
 @inner()
-def displace(
-    state: FloatArray,
-    curve: FloatArray,
-    lags: FloatArray,
-    growth: FloatArray,
-    first: int,
-    last: int,
-    drive: FloatArray,
-) -> None:
-    """Replace the drive's difference from rest by the displacement, at samples first to last.
-
-    ``curve`` (samples, 2) holds x² − x₀² and x³ − x₀³ of the nonlinearity, or is empty; ``lags``
-    (times, 3) holds each lag's two coefficients of the drive and the part that it keeps of itself;
-    ``growth`` (samples,) is |u| / U, or zero.
-    """
-    if curve.size > 0:
-        _bend(state, curve, first, last, drive)
-    if lags.size == 0:
-        _follow(state, last - first, drive)
+def displace(motion: Motion, shared: Shared, first: int, drive: FloatArray) -> None:
+    """Turn the drive (samples, lanes) into displacement, at samples from ``first`` on."""
+    if shared.curve.size > 0:
+        _bend(motion, shared.curve, first, drive)
+    if shared.lags.size == 0:
+        _follow(motion, drive)
     else:
-        _creep(state, lags, growth, first, last, drive)
+        _creep(motion, shared, first, drive)
 
 
 @inner(fastmath={"contract", "nsz"})
-def _bend(state: FloatArray, curve: FloatArray, first: int, last: int, drive: FloatArray) -> None:
+def _bend(motion: Motion, curve: FloatArray, first: int, drive: FloatArray) -> None:
     """Add q₂ (x² − x₀²) + q₃ (x³ − x₀³)."""
-    for t in range(first, last):
-        square, cube = curve[t, 0], curve[t, 1]
-        row = (t - first) * LANES
+    quadratic, cubic = motion.quadratic, motion.cubic
+    for t in range(len(drive)):
+        square, cube = curve[first + t, 0], curve[first + t, 1]
         for i in range(LANES):
-            drive[row + i] += square * state[QUADRATIC + i] + cube * state[CUBIC + i]
+            drive[t, i] += square * quadratic[i] + cube * cubic[i]
 
 
 @inner(fastmath={"contract", "nsz"})
-def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
+def _follow(motion: Motion, drive: FloatArray) -> None:
     """Apply the dynamics."""
-    for t in range(samples):
-        row = t * LANES
+    b0, b1, b2, a1, a2 = motion.b0, motion.b1, motion.b2, motion.a1, motion.a2
+    level, x1, x2 = motion.level, motion.x1, motion.x2
+    for t in range(len(drive)):
         for i in range(LANES):
-            w = drive[row + i]
-            x = state[B0 + i] * w + state[X1 + i]
-            state[X1 + i] = state[B1 + i] * w - state[A1 + i] * x + state[X2 + i]
-            state[X2 + i] = state[B2 + i] * w - state[A2 + i] * x
-            drive[row + i] = state[LEVEL + i] + x
+            w = drive[t, i]
+            x = b0[i] * w + x1[i]
+            x1[i] = b1[i] * w - a1[i] * x + x2[i]
+            x2[i] = b2[i] * w - a2[i] * x
+            drive[t, i] = level[i] + x
 
 
 @inner()
-def _creep(
-    state: FloatArray,
-    lags: FloatArray,
-    growth: FloatArray,
-    first: int,
-    last: int,
-    drive: FloatArray,
-) -> None:
+def _creep(motion: Motion, shared: Shared, first: int, drive: FloatArray) -> None:
     """Apply dynamics and creep."""
-    followed = np.empty_like(drive[: (last - first) * LANES])
-    for t in range(first, last):
-        row = (t - first) * LANES
+    equilibrium, crept, growth = motion.equilibrium, motion.crept, motion.growth
+    followed = np.empty_like(drive)
+    for t in range(len(drive)):
+        size = shared.growth[first + t]
         for i in range(LANES):
-            w = drive[row + i] + state[EQUILIBRIUM + i]
-            followed[row + i] = w * (1.0 + state[GROWTH + i] * growth[t]) - state[CREPT + i]
-    _follow(state, last - first, drive)
-    for k in range(lags.shape[0]):
-        at, strength = LAG + k * LANES, STRENGTH + k * LANES
-        lag = state[at : at + LANES].copy()
-        _lag(followed, lags[k], state[strength : strength + LANES].copy(), lag, drive)
-        for i in range(LANES):  # a slice's shape would be checked, by more code than all of this
-            state[at + i] = lag[i]
+            w = drive[t, i] + equilibrium[i]
+            followed[t, i] = w * (1.0 + growth[i] * size) - crept[i]
+    _follow(motion, drive)
+    for k in range(len(shared.lags)):
+        _lag(followed, shared.lags[k], motion.strength[k], motion.lag[k], drive)
 
 
 @inner(fastmath={"contract", "nsz"})
@@ -172,12 +171,11 @@ def _lag(
     lag: FloatArray,
     drive: FloatArray,
 ) -> None:
-    """Add one of the creep's lags. Separate arrays let a compiler take several lanes at once."""
+    """Add one of the creep's lags."""
     now, later, keep = coefficients
-    for t in range(followed.size // LANES):
-        row = t * LANES
+    for t in range(len(followed)):
         for i in range(LANES):
-            w = strength[i] * followed[row + i]
+            w = strength[i] * followed[t, i]
             x = now * w + lag[i]
             lag[i] = later * w + keep * x
-            drive[row + i] += x
+            drive[t, i] += x

@@ -7,10 +7,12 @@ if the fastest of them moves little in a sample; otherwise they are doubled from
 
 from __future__ import annotations
 
+from typing import Annotated, NamedTuple
+
 import numpy as np
 
 from bwbayes.arrays import FloatArray, gone
-from bwbayes.inference.compiled.lanes import LANES, inner
+from bwbayes.inference.compiled.lanes import LANES, Row, Struct, Structs, inner
 from bwbayes.model.compiled import compiled, formula
 from bwbayes.model.operators import scalar_memory as formulas
 from bwbayes.model.operators.scalar_memory import BENT, SHORT, RelaxingStep
@@ -19,169 +21,193 @@ relax, bent = compiled(formulas.relax), compiled(formulas.bent)
 series, third = compiled(formulas.series), compiled(formulas.third)
 relaxed = compiled(formulas.relaxed)
 
-# Rows of a model's numbers and memory; each name is the offset of a row. D and ALPHA have three
-# rows each. The rates that apply, of those for falling and rising voltages below zero and above,
-# are copied to separate rows: a compiler makes vectors of rows at known places.
-REST, H, D, ALPHA, RATES, BEFORE, Z, PHI_1, PHI_2, PHI_3, AGAINST, AHEAD, PAIR, W, FASTEST = (
-    LANES * row for row in (0, 1, 2, 5, 8, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25)
-)
+
+class Loops(Struct):
+    """Numbers and memory of models.
+
+    The rates that apply, of those for falling and rising voltages below zero and above (``pair``),
+    are copied to separate rows: a compiler makes vectors of rows at known places.
+    """
+
+    rest: Row
+    h: Row
+    d: Annotated[FloatArray, (3,)]
+    alpha: Annotated[FloatArray, (3,)]
+    rates: Annotated[FloatArray, (8,)]
+    pair: Row
+    against: Row
+    ahead: Row
+    fastest: Row
+    before: Row
+    z: Row
+    phi_1: Row
+    phi_2: Row
+    phi_3: Row
+    w: Row
 
 
-def rows(step: RelaxingStep, memory: FloatArray, voltage: float) -> FloatArray:
-    """Return the stage's initial rows, (models, rows), with w₀ first, for the step's memory."""
-    numbers, h = step.parameters, memory[:, 1]
-    group = np.zeros((h.size, FASTEST // LANES + 1))
-    d = numbers.T
-    group[:, 0] = voltage * (d[0] + voltage * (d[1] + voltage * d[2])) - h
-    group[:, 1], group[:, 2:16], group[:, 21:23] = h, numbers, numbers[:, [6, 10]]
-    group[:, 25] = np.abs(numbers[:, 6:]).max(axis=1)
-    return group
+class Relaxing(NamedTuple):
+    """Structs (groups,) of :class:`Loops`, and w₀ (models,), um.
 
+    Also whether f or a of any model is curved, and whether a rate depends on a sign.
+    """
 
-def planned(step: RelaxingStep) -> FloatArray:
-    """Return whether f or a of any model is curved, and whether a rate depends on a sign."""
-    curved = step.parameters[:, [1, 2, 4, 5]].any()
-    return np.array([[curved, step.signed]], dtype=np.float64)
+    loops: Structs
+    equilibrium: FloatArray
+    curved: bool
+    signed: bool
+
+    @classmethod
+    def of(cls, step: RelaxingStep, memory: FloatArray, voltage: float) -> Relaxing:
+        """Return models with a step's memory at a voltage."""
+        numbers, h = step.parameters, memory[:, 1]
+        d, alpha, rates = numbers[:, :3], numbers[:, 3:6], numbers[:, 6:]
+        rest = voltage * (d[:, 0] + voltage * (d[:, 1] + voltage * d[:, 2])) - h
+        fastest = np.abs(rates).max(axis=1)
+        named = {"rest": rest, "h": h, "d": d, "alpha": alpha, "rates": rates, "fastest": fastest}
+        named |= {"against": rates[:, 0], "ahead": rates[:, 4]}
+        return cls(Loops.filled(named), rest, step.curved, step.signed)
 
 
 @inner()
 def relaxing(
-    step: RelaxingStep,  # noqa: ARG001
-    group: FloatArray,
-    plan: FloatArray,
+    owner: None,  # noqa: ARG001
+    models: Relaxing,
+    group: int,
     voltage: FloatArray,
     first: int,
-    last: int,
     out: FloatArray,
 ) -> None:
-    """Write w − w₀ of samples ``first`` to ``last`` to ``out`` and move h on."""
-    curved, signed = plan[0, 0] > 0.0, plan[0, 1] > 0.0
+    """Write w − w₀ of samples from ``first`` on to ``out`` (samples, lanes); advance h."""
+    loops, curved, signed = models.loops[group], models.curved, models.signed
+    fastest, w = loops.fastest, loops.w
     steepest = 0.0
     for i in range(LANES):
-        steepest = max(steepest, group[FASTEST + i])
-    for t in range(first, last):
-        u = voltage[t]
-        before = voltage[t - 1] if t > 0 else u
-        row = (t - first) * LANES
+        steepest = max(steepest, fastest[i])
+    for t in range(len(out)):
+        u = voltage[first + t]
+        before = voltage[first + t - 1] if first + t > 0 else u
         # If the rates depend on the voltage's sign, go to zero volts and on from there.
         end = 0.0 if signed and before * u < 0.0 else u
         while True:
             if signed:
-                _take(group, before, end)
-            _move(group, before, end, steepest, curved)
+                _take(loops, before, end)
+            _move(loops, before, end, steepest, curved)
             if end == u:
                 break
             before, end = end, u
         for i in range(LANES):
-            out[row + i] = group[W + i]
+            out[t, i] = w[i]
 
 
 @inner()
-def _take(group: FloatArray, before: float, u: float) -> None:
+def _take(loops: Loops, before: float, u: float) -> None:
     """Select the rates that apply between two voltages."""
     pair = 2 * int(u > before) + int(before + u > 0.0)
-    if group[PAIR] == pair:
+    if loops.pair[0] == pair:
         return
-    group[PAIR] = pair
+    loops.pair[0] = pair
     for i in range(LANES):
-        group[AGAINST + i] = group[RATES + pair * LANES + i]
-        group[AHEAD + i] = group[RATES + (4 + pair) * LANES + i]
+        loops.against[i] = loops.rates[pair, i]
+        loops.ahead[i] = loops.rates[4 + pair, i]
 
 
 @inner()
-def _move(group: FloatArray, before: float, u: float, steepest: float, curved: bool) -> None:
+def _move(loops: Loops, before: float, u: float, steepest: float, curved: bool) -> None:
     """Move h along a step on which the voltage keeps its sign, and write w − w₀."""
     s, v = 1.0 if u > before else -1.0, abs(u - before)
     short = v * steepest <= (BENT if curved else SHORT)
     if not short:
-        _phi(group, s, v, steepest, curved)
+        _phi(loops, s, v, steepest, curved)
     if curved:
-        _bend(group, s, before, u, v, short)
-    elif _straight(group, s, u, v, short) > 0:
-        _cross(group, s, u, v)
+        _bend(loops, s, before, u, v, short)
+    elif _straight(loops, s, u, v, short) > 0:
+        _cross(loops, s, u, v)
 
 
 @inner(fastmath={"contract", "nsz"})
-def _straight(group: FloatArray, s: float, u: float, v: float, short: bool) -> int:
+def _straight(loops: Loops, s: float, u: float, v: float, short: bool) -> int:
     """Move h along a step, with φ₁ known or z small; return how many models passed zero."""
+    h, d, alpha, rest = loops.h, loops.d[0], loops.alpha[0], loops.rest
+    against, ahead, phi_1 = loops.against, loops.ahead, loops.phi_1
+    before, w = loops.before, loops.w
     passed = 0
     for i in range(LANES):
-        g = s * group[H + i]
+        g = s * h[i]
         # Read all rows first: a compiler does not make vectors of conditional reads.
-        slow, fast, phi = group[AGAINST + i], group[AHEAD + i], group[PHI_1 + i]
+        slow, fast, phi = against[i], ahead[i], phi_1[i]
         rate = slow if g < 0.0 else fast
-        new = relax(g, v, group[ALPHA + i], rate, series(rate * v) if short else phi)
+        new = relax(g, v, alpha[i], rate, series(rate * v) if short else phi)
         passed += (g < 0.0) & (new > 0.0)
-        group[BEFORE + i] = g
-        group[H + i] = s * new
-        group[W + i] = group[D + i] * u - s * new - group[REST + i]
+        before[i] = g
+        h[i] = s * new
+        w[i] = d[i] * u - s * new - rest[i]
     return passed
 
 
 @inner()
-def _cross(group: FloatArray, s: float, u: float, v: float) -> None:
+def _cross(loops: Loops, s: float, u: float, v: float) -> None:
     """Redo the models whose g passed zero within the step, where its rate changes."""
+    d, alpha = loops.d[0], loops.alpha[0]
     for i in range(LANES):
-        g = group[BEFORE + i]
-        if g < 0.0 < s * group[H + i]:
-            new, _ = relaxed(g, v, group[ALPHA + i], 0.0, 0.0, group[AGAINST + i], group[AHEAD + i])
-            group[H + i] = s * new
-            group[W + i] = group[D + i] * u - s * new - group[REST + i]
+        g = loops.before[i]
+        if g < 0.0 < s * loops.h[i]:
+            new, _ = relaxed(g, v, alpha[i], 0.0, 0.0, loops.against[i], loops.ahead[i])
+            loops.h[i] = s * new
+            loops.w[i] = d[i] * u - s * new - loops.rest[i]
 
 
 @inner(fastmath={"contract", "nsz"})
-def _bend(group: FloatArray, s: float, before: float, u: float, v: float, short: bool) -> None:
+def _bend(loops: Loops, s: float, before: float, u: float, v: float, short: bool) -> None:
     """Move h along a step with one rate and a strength that changes, with φ known or z small."""
+    hs, ahead, rest, w = loops.h, loops.ahead, loops.rest, loops.w
+    d, d2, d3 = loops.d[0], loops.d[1], loops.d[2]
+    alpha, alpha1, alpha2 = loops.alpha[0], loops.alpha[1], loops.alpha[2]
+    first, second, third_ = loops.phi_1, loops.phi_2, loops.phi_3
     for i in range(LANES):
-        rate, h = group[AHEAD + i], group[H + i]
-        alpha, alpha1, alpha2 = (
-            group[ALPHA + i],
-            group[ALPHA + LANES + i],
-            group[ALPHA + 2 * LANES + i],
-        )
-        strength, tilt = alpha + before * (alpha1 + before * alpha2), alpha1 + 2 * before * alpha2
-        phi_1, phi_2, phi_3 = group[PHI_1 + i], group[PHI_2 + i], group[PHI_3 + i]
+        rate = ahead[i]
+        strength = alpha[i] + before * (alpha1[i] + before * alpha2[i])
+        tilt = alpha1[i] + 2 * before * alpha2[i]
+        phi_1, phi_2, phi_3 = first[i], second[i], third_[i]
         if short:
             phi_3 = third(rate * v)
             phi_2 = 0.5 - rate * v * phi_3
             phi_1 = 1.0 - rate * v * phi_2
-        h = s * bent(s * h, v, strength, rate, s * tilt, 2.0 * alpha2, phi_1, phi_2, phi_3)
-        group[H + i] = h
-        f = u * (group[D + i] + u * (group[D + LANES + i] + u * group[D + 2 * LANES + i]))
-        group[W + i] = f - h - group[REST + i]
+        g, twist = s * hs[i], 2.0 * alpha2[i]
+        h = s * bent(g, v, strength, rate, s * tilt, twist, phi_1, phi_2, phi_3)
+        hs[i] = h
+        w[i] = u * (d[i] + u * (d2[i] + u * d3[i])) - h - rest[i]
 
 
 @inner(fastmath={"contract", "nsz"})
-def _phi(group: FloatArray, s: float, v: float, steepest: float, curved: bool) -> None:
+def _phi(loops: Loops, s: float, v: float, steepest: float, curved: bool) -> None:
     """Work out φ₁, and φ₂ and φ₃ if they are needed, by their series and doublings of z.
 
     φ₁(−2z) = φ₁ (1 + e⁻ᶻ)/2, φ₂(−2z) = (φ₁² + 2 φ₂)/4, φ₃(−2z) = (φ₁ φ₂ + φ₂ + 2 φ₃)/8.
     """
+    h, against, ahead, z = loops.h, loops.against, loops.ahead, loops.z
+    phi_1, phi_2, phi_3 = loops.phi_1, loops.phi_2, loops.phi_3
     length, doublings = v, 0
     while length * steepest > (BENT if curved else SHORT):
         length *= 0.5
         doublings += 1
     for i in range(LANES):
-        slow, fast = group[AGAINST + i], group[AHEAD + i]
-        z = (slow if s * group[H + i] < 0.0 else fast) * length
-        group[Z + i] = z
-        group[PHI_1 + i] = series(z)
+        slow, fast = against[i], ahead[i]
+        z[i] = (slow if s * h[i] < 0.0 else fast) * length
+        phi_1[i] = series(z[i])
     if curved:
         for i in range(LANES):
-            z = group[Z + i]
-            phi_3 = third(z)
-            phi_2 = 0.5 - z * phi_3
-            group[PHI_3 + i], group[PHI_2 + i], group[PHI_1 + i] = phi_3, phi_2, 1.0 - z * phi_2
+            phi_3[i] = third(z[i])
+            phi_2[i] = 0.5 - z[i] * phi_3[i]
+            phi_1[i] = 1.0 - z[i] * phi_2[i]
     for _ in range(doublings):
         if curved:
             for i in range(LANES):
-                phi_1, phi_2 = group[PHI_1 + i], group[PHI_2 + i]
-                group[PHI_3 + i] = 0.125 * (phi_1 * phi_2 + phi_2 + 2.0 * group[PHI_3 + i])
-                group[PHI_2 + i] = 0.25 * (phi_1 * phi_1 + 2.0 * phi_2)
+                phi_3[i] = 0.125 * (phi_1[i] * phi_2[i] + phi_2[i] + 2.0 * phi_3[i])
+                phi_2[i] = 0.25 * (phi_1[i] * phi_1[i] + 2.0 * phi_2[i])
         for i in range(LANES):
-            z, phi_1 = group[Z + i], group[PHI_1 + i]
-            group[PHI_1 + i] = phi_1 * (1.0 - 0.5 * z * phi_1)
-            group[Z + i] = 2.0 * z
+            phi_1[i] *= 1.0 - 0.5 * z[i] * phi_1[i]
+            z[i] = 2.0 * z[i]
 
 
 @inner()

@@ -1,10 +1,9 @@
 """The hysteresis stages of the compiled likelihood, and their choice for an operator.
 
 A stage writes the drive's difference from that of the first sample, w − w₀, for a piece of a record
-and for ``LANES`` models side by side. The numbers and the memory of a model are in rows of
-``LANES`` numbers of one flat array, ``group``; ``plan`` holds numbers that the stage needs in
-advance. An operator that has a step (:mod:`bwbayes.model.operator`) is advanced by it; the drive of
-an operator with neither step nor stage is worked out beforehand, and is the plan.
+and for ``LANES`` models side by side. The type of its models, a tuple of arrays, selects it. An
+operator that has a step (:mod:`bwbayes.model.operator`) is advanced by it; the drive of an operator
+with neither step nor stage is worked out beforehand.
 """
 
 from __future__ import annotations
@@ -15,10 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba.extending import overload
 
-from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled import extrema, pinned, relaxing
-from bwbayes.inference.compiled.lanes import LANES, inner
-from bwbayes.model.compiled import FormulaType, formula
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.compiled import pinned
+from bwbayes.inference.compiled.extrema import Branches, along_branches
+from bwbayes.inference.compiled.lanes import LANES, inner, repeat_last
+from bwbayes.inference.compiled.relaxing import Relaxing, relaxing, steps_moved
+from bwbayes.model.compiled import formula
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import HysteresisStep, Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
@@ -26,20 +27,47 @@ from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.operators.scalar_memory import RelaxingStep
 from bwbayes.model.stage import Stage
 
-Kind = HysteresisStep | RemembersExtrema | None
+
+class Given(NamedTuple):
+    """A known drive (any, samples) from sample ``begin`` on, and w₀ (models,), um.
+
+    ``number`` (models,) is the index of a model's drive.
+    """
+
+    drive: FloatArray
+    begin: int
+    number: IntArray
+    equilibrium: FloatArray
+
+    @classmethod
+    def of(cls, drive: FloatArray, models: int | None = None) -> Given:
+        """Return models with a drive (models, samples), um; ``models`` may share fewer drives."""
+        number = np.arange(models or len(drive)) % len(drive)
+        # Keep one layout: numba would compile all functions once more for another one.
+        return cls(np.ascontiguousarray(drive), 0, number, drive[number, 0])
+
+
+class Stepped(NamedTuple):
+    """Numbers and memory (models, any) of a step, and w₀ (models,), um."""
+
+    numbers: FloatArray
+    memory: FloatArray
+    equilibrium: FloatArray
+
+
+Owner = HysteresisStep | RemembersExtrema | None
+Models = Given | Stepped | Relaxing | Branches
 
 
 class CompiledDrive(NamedTuple):
-    """Initial state of a compiled stage.
+    """A compiled stage: the object that brings a formula, None without one, and its models.
 
-    ``kind`` is the object with its formula, None for a known drive; ``equilibrium`` (models,) is
-    w₀, um; ``group`` (models, rows) and ``plan`` depend on the stage.
+    They are two arguments of a compiled function, as numba takes long to tell the type of a tuple
+    that holds such an object.
     """
 
-    kind: Kind
-    equilibrium: FloatArray
-    group: FloatArray
-    plan: FloatArray
+    owner: Owner
+    models: Models
 
 
 def prepared(
@@ -47,18 +75,15 @@ def prepared(
 ) -> CompiledDrive | None:
     """Return the stage for an operator's models; None if NumPy has to make the drive."""
     if isinstance(operator, RemembersExtrema):
-        group = extrema.rows(voltage, memory)
-        return CompiledDrive(operator, memory.displacement, group, operator.numbers(column))
+        return CompiledDrive(operator, Branches.of(operator.numbers(column), voltage, memory))
     if type(operator).step is Operator.step:
         return None
     step = operator.step(column)
     state = step.remembered(memory)
     if isinstance(step, RelaxingStep):
-        group, plan_rows = relaxing.rows(step, state, voltage[0]), relaxing.planned(step)
-        return CompiledDrive(step, group[:, 0], group, plan_rows)
+        return CompiledDrive(None, Relaxing.of(step, state, voltage[0]))
     equilibrium = step.apply(state, np.full(len(state), voltage[0])).w
-    group = np.column_stack([np.arange(equilibrium.size), equilibrium, state])
-    return CompiledDrive(step, equilibrium, group, step.parameters)
+    return CompiledDrive(step, Stepped(step.parameters, np.array(state), equilibrium))
 
 
 def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
@@ -67,39 +92,28 @@ def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
     return pinned.drive if integrated else type(operator).advance
 
 
-def given(drive: FloatArray, models: int | None = None) -> CompiledDrive:
-    """Return a stage for a known drive (models, samples), um; ``models`` may share fewer drives."""
-    number = np.arange(models or len(drive)) % len(drive)
-    equilibrium = drive[number, 0]
-    group = np.stack([number, equilibrium], axis=1)
-    # Keep one layout: numba would compile all functions once more for another one.
-    return CompiledDrive(None, equilibrium, group, np.ascontiguousarray(drive))
+def drive_of(owner: Any, models: Any, group: Any, voltage: Any, first: Any, out: Any) -> None:
+    """Write w − w₀ of samples from ``first`` on to ``out`` (samples, lanes); advance the memory.
 
-
-def drive_of(
-    kind: Any, group: Any, plan: Any, voltage: Any, first: Any, last: Any, out: Any
-) -> None:
-    """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and advance the memory.
-
-    The type of ``kind`` selects the stage, so that no other one is compiled.
+    The type of ``models`` selects the stage, so that no other one is compiled.
     """
     raise NotImplementedError
 
 
 @overload(drive_of, strict=False)
 def _compiled_drive_of(
-    kind: Any, group: Any, plan: Any, voltage: Any, first: Any, last: Any, out: Any
+    owner: Any, models: Any, group: Any, voltage: Any, first: Any, out: Any
 ) -> Any:
-    del group, plan, voltage, first, last, out
-    stage: Any = _given
-    if isinstance(kind, FormulaType):
-        stage = _stepped
-        if issubclass(kind.kind, RelaxingStep):
-            stage = relaxing.relaxing
-        elif issubclass(kind.kind, RemembersExtrema):
-            stage = extrema.along_branches
-    return lambda kind, group, plan, voltage, first, last, out: stage(  # noqa: PLW0108  # a source
-        kind, group, plan, voltage, first, last, out
+    del owner, group, voltage, first, out
+    stages: dict[type, Any] = {
+        Given: _given,
+        Stepped: _stepped,
+        Relaxing: relaxing,
+        Branches: along_branches,
+    }
+    stage = stages[models.instance_class]
+    return lambda owner, models, group, voltage, first, out: stage(  # noqa: PLW0108  # a source
+        owner, models, group, voltage, first, out
     )
 
 
@@ -119,7 +133,7 @@ def _compiled_move_lanes(
     del numbers, memory, values, after, result
     move: Any = _stages_moved if issubclass(kind.kind, Stage) else _steps_moved
     if issubclass(kind.kind, RelaxingStep):
-        move = relaxing.steps_moved
+        move = steps_moved
     return lambda kind, numbers, memory, values, after, result: move(  # noqa: PLW0108  # a source
         kind, numbers, memory, values, after, result
     )
@@ -153,45 +167,40 @@ def _steps_moved(
 
 @inner(fastmath={"contract", "nsz"})
 def _given(
-    kind: None,  # noqa: ARG001
-    group: FloatArray,
-    plan: FloatArray,
+    owner: None,  # noqa: ARG001
+    models: Given,
+    group: int,
     voltage: FloatArray,  # noqa: ARG001
     first: int,
-    last: int,
     out: FloatArray,
 ) -> None:
-    """Copy a known drive: the row of the plan whose index is the first number of a model."""
-    for i in range(LANES):
-        drive = plan[int(group[i])]
-        for t in range(first, last):
-            out[(t - first) * LANES + i] = drive[t] - group[LANES + i]
+    """Copy a known drive."""
+    count = min(LANES, models.number.size - group * LANES)
+    for i in range(count):
+        model = group * LANES + i
+        drive, equilibrium = models.drive[models.number[model]], models.equilibrium[model]
+        for t in range(len(out)):
+            out[t, i] = drive[first - models.begin + t] - equilibrium
+    repeat_last(count, out)
 
 
 @inner()
 def _stepped(
     step: HysteresisStep,
-    group: FloatArray,
-    plan: FloatArray,
+    models: Stepped,
+    group: int,
     voltage: FloatArray,
     first: int,
-    last: int,
     out: FloatArray,
 ) -> None:
-    """Step one model after the other, sample by sample.
-
-    Rows are a model's number in the plan, w₀, and its step's memory.
-    """
-    memory = np.empty(group.size // LANES - 2)
-    after = np.empty(memory.size)
-    for i in range(LANES):
-        parameters = plan[int(group[i])]
-        for k in range(memory.size):
-            memory[k] = group[(2 + k) * LANES + i]
-        for t in range(first, last):
-            w, _ = formula(step, parameters, memory, voltage[t], after)
-            out[(t - first) * LANES + i] = w - group[LANES + i]
-            for k in range(memory.size):
-                memory[k] = after[k]
-        for k in range(memory.size):
-            group[(2 + k) * LANES + i] = memory[k]
+    """Step one model after the other, sample by sample."""
+    after = np.empty(models.memory.shape[1])
+    count = min(LANES, models.equilibrium.size - group * LANES)
+    for i in range(count):
+        model = group * LANES + i
+        memory, numbers = models.memory[model], models.numbers[model]
+        for t in range(len(out)):
+            w, _ = formula(step, numbers, memory, voltage[first + t], after)
+            out[t, i] = w - models.equilibrium[model]
+            memory[:] = after
+    repeat_last(count, out)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import inner
 from bwbayes.inference.heavy_tails import Steps
@@ -15,33 +15,18 @@ from bwbayes.inference.heavy_tails import Steps
 
 def run(steps: Steps, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
     """Run the filter as :func:`bwbayes.inference.heavy_tails.run` does."""
-    models, _, readings = steps.series.shape
-    log_density = np.full(models, -0.5 * readings * np.log(2 * np.pi))
-    error, spread, sensor = np.empty((3, models, readings))
     # Numba would compile the function for each layout of an array.
     arrays: list[Any] = [*map(np.ascontiguousarray, steps)]
-    _run(*[*arrays, mean, covariance, log_density, error, spread, sensor])
-    return log_density, error, spread, sensor
+    return _run(Steps(*arrays), mean, covariance)
 
 
 @compile_cached(error_model="numpy")
-def _run(
-    transitions: FloatArray,
-    gained: FloatArray,
-    gaps: IntArray,
-    variances: FloatArray,
-    logs: FloatArray,
-    observe: FloatArray,
-    series: FloatArray,
-    means: FloatArray,
-    covariances: FloatArray,
-    log_densities: FloatArray,
-    errors: FloatArray,
-    spreads: FloatArray,
-    sensors: FloatArray,
-) -> None:
-    """Add to the log densities, and write the other results; arguments are as in :class:`Steps`."""
+def _run(steps: Steps, means: FloatArray, covariances: FloatArray) -> tuple[FloatArray, ...]:
+    transitions, gained, gaps, variances, logs, observe, series = steps
     models, count, readings = series.shape
+    log_densities = np.full(models, -0.5 * readings * np.log(2 * np.pi))
+    errors, spreads = np.empty((models, readings)), np.empty((models, readings))
+    sensors = np.empty((models, readings))
     states, size = observe.size, means.shape[1]
     row, gain, cross = np.zeros(size), np.empty(size), np.empty(size)
     row[:states] = observe
@@ -66,6 +51,7 @@ def _run(
             log_densities[model] += log
             errors[model, t], spreads[model, t], sensors[model, t] = error, spread, sensor
             _update(covariance, mean, row, after, (error, rate, doubt, sensor), gain, cross)
+    return log_densities, errors, spreads, sensors
 
 
 @inner(error_model="numpy")

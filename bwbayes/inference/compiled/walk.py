@@ -15,14 +15,15 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.caching import compile_cached
-from bwbayes.inference.compiled.lanes import LAG, LANES, STATE, X1, by_rows, in_lanes, inner
-from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
-from bwbayes.inference.compiled.relaxing import planned
+from bwbayes.inference.compiled.lanes import LANES, Structs, inner
+from bwbayes.inference.compiled.motion import PIECE, Motion, Shared, displace, physics
 from bwbayes.inference.compiled.stages import (
-    Kind,
+    CompiledDrive,
+    Given,
+    Models,
+    Owner,
     advance_of,
     drive_of,
-    given,
     move_lanes,
     prepared,
 )
@@ -92,32 +93,26 @@ def _walk_core(
 
         memory = actuator.begin(column, voltage, from_rest=from_rest)
         compiled = prepared(operator, column, voltage, memory)
-    stage = compiled or given(advance(inputs[:1], memory)[0])
+    source = compiled or CompiledDrive(None, Given.of(advance(inputs[:1], memory)[0]))
     sections = actuator.sections(column)
-    named = physics(actuator, sections, column, stage.equilibrium, voltage)
-    models = by_rows(named, STATE // LANES)
+    named = physics(actuator, sections, column, source.models.equilibrium, voltage)
     moving, *crept = sections.begin(initial_transient)
-    models[:, X1 // LANES : X1 // LANES + moving.shape[1]] = moving
-    for row, lag in enumerate(crept, LAG // LANES):
-        models[:, row] = lag[:, 0]
-    groups, state, now = in_lanes(stage.group), in_lanes(models), 0
+    named |= dict(zip(("x1", "x2"), moving.T, strict=False))
+    if crept:
+        named |= {"lag": np.concatenate(crept, axis=1)}
+    motions, now = Motion.filled(named), 0
     # A read-only view, so that numba compiles only one signature.
     read_only = np.broadcast_to(voltage, voltage.shape)
-    curve, lags, growth = shared(actuator, voltage)
+    shared = Shared.of(actuator, voltage)
 
     def onwards(last: int) -> FloatArray:
         nonlocal memory, now
         displacement = np.empty((column["offset"].size, last - now))
-        window, begin, plan = slice(0, None), now, stage.plan
-        if compiled is None:
-            # The drive of this window is known: its other inputs begin at the same sample.
-            window, begin = slice(now, last), 0
-            drive, memory = advance(inputs[window], memory)
-            plan = np.ascontiguousarray(drive)
-        _walk(
-            stage.kind, groups, plan, curve[window], lags, growth[window], state, read_only[window],
-            begin, begin + last - now, displacement,
-        )  # fmt: skip
+        window, models = inputs[now:last], source.models
+        if isinstance(models, Given):
+            drive, memory = advance(window, memory)
+            models = models._replace(drive=np.ascontiguousarray(drive), begin=now)
+        _walk(source.owner, models, shared, motions, read_only, now, displacement)
         now = last
         return displacement
 
@@ -165,29 +160,26 @@ def _of_own(
 
 @compile_cached()
 def _walk(
-    kind: Kind,
-    groups: FloatArray,
-    plan: FloatArray,
-    curve: FloatArray,
-    lags: FloatArray,
-    growth: FloatArray,
-    state: FloatArray,
+    owner: Owner,
+    models: Models,
+    shared: Shared,
+    motions: Structs,
     voltage: FloatArray,
-    first: int,
-    last: int,
+    begin: int,
     displacement: FloatArray,
 ) -> None:
-    """Advance all models from sample ``first`` to ``last``; write their displacement."""
-    drive = np.empty(PIECE * LANES)
-    for group in range(state.shape[0]):
-        models = min(LANES, displacement.shape[0] - group * LANES)
-        for now in range(first, last, PIECE):
-            end = min(now + PIECE, last)
-            drive_of(kind, groups[group], plan, voltage, now, end, drive)
-            displace(state[group], curve, lags, growth, now, end, drive)
-            for i in range(models):
-                for t in range(now, end):
-                    displacement[group * LANES + i, t - first] = drive[(t - now) * LANES + i]
+    """Advance all models from a sample on; write their displacement (models, samples)."""
+    count, samples = displacement.shape
+    drives = np.empty((PIECE, LANES))
+    for group in range(len(motions)):
+        for first in range(0, samples, PIECE):
+            last = min(first + PIECE, samples)
+            drive = drives[: last - first]
+            drive_of(owner, models, group, voltage, begin + first, drive)
+            displace(motions[group], shared, begin + first, drive)
+            for i in range(min(LANES, count - group * LANES)):
+                for t in range(first, last):
+                    displacement[group * LANES + i, t] = drive[t - first, i]
 
 
 def _advance_stage(
@@ -216,7 +208,7 @@ def _drive_of_own(
     drive, after, numbers = np.empty(voltage.shape), memory.copy(), step.parameters
     if isinstance(step, RelaxingStep):
         # Add the row that tells its lanes whether any model is curved or depends on a sign.
-        numbers = np.column_stack([numbers, np.full(len(numbers), planned(step).any())])
+        numbers = np.column_stack([numbers, np.full(len(numbers), step.curved or step.signed)])
     _pass(step, numbers, after, np.ascontiguousarray(voltage), np.empty(0), drive)
     return drive, after
 

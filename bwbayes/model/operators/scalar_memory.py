@@ -266,6 +266,11 @@ class RelaxingStep(OneStateStep):
         return cls(numbers)
 
     @cached_property
+    def curved(self) -> bool:
+        """Whether any model's f or a is more than d u or α."""
+        return bool(self.parameters[:, [1, 2, 4, 5]].any())
+
+    @cached_property
     def signed(self) -> bool:
         """Whether any model's rates know the signs of the voltage or its direction."""
         rates = self.parameters[:, 6:].reshape(-1, 2, 4)
