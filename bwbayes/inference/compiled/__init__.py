@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, whitening
-from bwbayes.inference.compiled.filter import Filter, Step
+from bwbayes.inference.compiled.filter import PAIR, Filter, Step
 from bwbayes.inference.compiled.kernels import Readings, Unknowns
 from bwbayes.inference.compiled.lanes import apart
 from bwbayes.inference.compiled.motion import Motion, Shared, physics, simulated
@@ -70,9 +70,7 @@ def products(
     core, make = (actuator.linear, simulated) if simulates else (actuator, physics)
     shared = Shared.of(core, record.voltage)
     pairs, logs = np.empty((len(theta), series, series)), np.empty(len(theta))
-    order = np.arange(series)
-    high, low = np.maximum.outer(order, order), np.minimum.outer(order, order)
-    pair = high * (high + 1) // 2 + low
+    pair = PAIR[:series, :series]
     for rows, source in _staged(likelihood, column, record.voltage, displacement):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = source.models.equilibrium
@@ -83,9 +81,9 @@ def products(
         motions = Motion.filled(named, rows)
         kernels.sums(record, *source, shared, motions, filters, over, second, unknowns)
         models = source.models.equilibrium.size
-        pairs[rows] = apart(filters["products"], models)[:, pair]
+        pairs[rows] = apart(filters["products"][:, pair], models)
         logs[rows] = apart(filters["log"], models)
-    typical = readings.rows.size * np.log(steps["q_11"][:, 0] + filtering["sensor"])
+    typical = readings.rows.size * np.log(steps["q"][:, 0, 0, 0] + filtering["sensor"])
     return pairs, typical + logs
 
 
@@ -122,9 +120,8 @@ def _filtering(
     """
     stationary, observe, states = noise.stationary(theta), noise.observe, noise.states
     variance = observe @ stationary @ observe
-    plain = np.array_equal(observe, np.eye(states)[:1].ravel()) and np.array_equal(
-        stationary, variance[:, np.newaxis, np.newaxis] * np.eye(states)
-    )
+    unit = np.eye(states)
+    plain = np.all(observe == unit[:1]) and np.all(stationary == np.multiply.outer(variance, unit))
     turned = None if plain else _observed_first(stationary, observe)
     size = max(states, 1)
     f_matrices, gained = np.zeros((2, len(theta), missing.size, size, size))
@@ -134,12 +131,7 @@ def _filtering(
             f = turned @ f @ np.linalg.inv(turned)
             q = turned @ q @ np.swapaxes(turned, 1, 2)
         f_matrices[:, gap], gained[:, gap] = f, q
-    steps = {}
-    for i, j in np.ndindex(size, size):
-        steps[f"f_{i + 1}{j + 1}"] = f_matrices[..., i, j]
-        if i <= j:
-            steps[f"q_{i + 1}{j + 1}"] = gained[..., i, j]
-    return steps, {
+    return {"f": f_matrices, "q": gained}, {
         "sensor": theta[:, 0] ** 2, "covariance": variance, "covariance_22": variance,
         "ratio": np.ones(len(theta)), "change": np.full(len(theta), np.inf),
     }  # fmt: skip

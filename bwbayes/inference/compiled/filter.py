@@ -27,18 +27,19 @@ from bwbayes.model.linear import MOST_TIMES
 SERIES = 4 + MOST_TIMES
 
 Each = Annotated[FloatArray, (SERIES,)]
+Matrix = Annotated[FloatArray, (2, 2)]
+
+# Where products of innovations are, by the indices of their series.
+ORDER = np.arange(SERIES)
+HIGH = np.maximum.outer(ORDER, ORDER)
+PAIR = HIGH * (HIGH + 1) // 2 + np.minimum.outer(ORDER, ORDER)
 
 
 class Step(Struct):
-    """The filter's step from a reading to the next: F and Q."""
+    """The filter's step from a reading to the next."""
 
-    f_11: Row
-    f_12: Row
-    f_21: Row
-    f_22: Row
-    q_11: Row
-    q_12: Row
-    q_22: Row
+    f: Matrix
+    q: Matrix
 
 
 class Filter(Struct):
@@ -89,7 +90,7 @@ def follow(
     """
     step, gain, gain_2, innovations = state.step, state.gain, state.gain_2, state.innovation
     estimate, estimate_2 = state.estimate[0], state.estimate_2[0]
-    f_11, f_12, f_21, f_22 = step.f_11, step.f_12, step.f_21, step.f_22
+    f_11, f_12, f_21, f_22 = step.f[0, 0], step.f[0, 1], step.f[1, 0], step.f[1, 1]
     squares, latest = state.squares, state.latest
     count = series.size
     for k in range(count):
@@ -164,11 +165,11 @@ def _fold(
 def _parts(state: Filter, second: bool | None, i: int, rho: float) -> tuple[float, float]:
     """Return c and c₂, the ratios of both estimates to a response that keeps ρ of itself."""
     step = state.step
-    gain, first = float(state.gain[i]), rho - step.f_11[i]
+    gain, first = float(state.gain[i]), rho - step.f[0, 0, i]
     if second is None:
         return gain / (first + gain), 0.0
-    gain_2, last = state.gain_2[i], rho - step.f_22[i]
-    f_12, f_21 = step.f_12[i], step.f_21[i]
+    gain_2, last = state.gain_2[i], rho - step.f[1, 1, i]
+    f_12, f_21 = step.f[0, 1, i], step.f[1, 0, i]
     total = (first + gain) * last + f_12 * (gain_2 - f_21)
     return (gain * last + f_12 * gain_2) / total, (first * gain_2 + f_21 * gain) / total
 
@@ -267,10 +268,10 @@ def innovate(
             over = steps[gaps[t]]
             for i in range(LANES):
                 before = estimate[i]
-                estimate[i] = over.f_11[i] * before
+                estimate[i] = over.f[0, 0, i] * before
                 if second is not None:
-                    estimate[i] += over.f_12[i] * other[i]
-                    other[i] = over.f_22[i] * other[i] + over.f_21[i] * before
+                    estimate[i] += over.f[0, 1, i] * other[i]
+                    other[i] = over.f[1, 1, i] * other[i] + over.f[1, 0, i] * before
         if gaps[t] < 0:
             for i in range(LANES):
                 values[t, i] = 0.0
@@ -279,10 +280,10 @@ def innovate(
                 before = estimate[i]
                 innovation = values[t, i] - before
                 values[t, i] = innovation
-                estimate[i] = step.f_11[i] * before + gains[t, i] * innovation
+                estimate[i] = step.f[0, 0, i] * before + gains[t, i] * innovation
                 if second is not None:
-                    estimate[i] += step.f_12[i] * other[i]
-                    other[i] = step.f_22[i] * other[i] + step.f_21[i] * before
+                    estimate[i] += step.f[0, 1, i] * other[i]
+                    other[i] = step.f[1, 1, i] * other[i] + step.f[1, 0, i] * before
                     other[i] += gains_2[t, i] * innovation
 
 
@@ -296,15 +297,15 @@ def _advance(state: Filter, second: bool | None) -> None:
         variance = p + sensor
         inverse = 1.0 / variance
         state.inverse[i] = inverse
-        state.ratio[i] *= variance / (step.q_11[i] + sensor)
+        state.ratio[i] *= variance / (step.q[0, 0, i] + sensor)
         if second is None:
-            state.gain[i] = step.f_11[i] * (p * inverse)
+            state.gain[i] = step.f[0, 0, i] * (p * inverse)
             covariance[i] = p * (sensor * inverse)
         else:
             across, remainder = covariance_12[i], sensor * inverse
             g, g_2 = p * inverse, across * inverse
-            state.gain[i] = step.f_11[i] * g + step.f_12[i] * g_2
-            state.gain_2[i] = step.f_22[i] * g_2 + step.f_21[i] * g
+            state.gain[i] = step.f[0, 0, i] * g + step.f[0, 1, i] * g_2
+            state.gain_2[i] = step.f[1, 1, i] * g_2 + step.f[1, 0, i] * g
             covariance[i], covariance_12[i] = p * remainder, across * remainder
             state.covariance_22[i] -= across * g_2
         # Keep the former covariance for a comparison.
@@ -320,17 +321,17 @@ def _predict(state: Filter, second: bool | None, step: Step) -> None:
     covariance, covariance_12 = state.covariance, state.covariance_12
     covariance_22 = state.covariance_22
     for i in range(LANES):
-        a, p, gained = step.f_11[i], covariance[i], step.q_11[i]
+        a, p, gained = step.f[0, 0, i], covariance[i], step.q[0, 0, i]
         if second is None:
             covariance[i] = a * a * p + gained
         else:
-            b, c, d = step.f_12[i], step.f_21[i], step.f_22[i]
+            b, c, d = step.f[0, 1, i], step.f[1, 0, i], step.f[1, 1, i]
             p_12, p_22 = covariance_12[i], covariance_22[i]
             top, bottom = a * p + b * p_12, a * p_12 + b * p_22
             low, end = d * p_12 + c * p, d * p_22 + c * p_12
             covariance[i] = a * top + b * bottom + gained
-            covariance_12[i] = d * bottom + c * top + step.q_12[i]
-            covariance_22[i] = d * end + c * low + step.q_22[i]
+            covariance_12[i] = d * bottom + c * top + step.q[0, 1, i]
+            covariance_22[i] = d * end + c * low + step.q[1, 1, i]
 
 
 @inner()
@@ -349,5 +350,5 @@ def gather(state: Filter, readings: int) -> None:
     for i in range(LANES):
         state.products[0, i] += state.squares[i] * state.inverse[i]
         state.squares[i] = 0.0
-        typical = state.step.q_11[i] + state.sensor[i]
+        typical = state.step.q[0, 0, i] + state.sensor[i]
         state.log[i] -= readings * math.log(state.inverse[i] * typical)

@@ -80,7 +80,9 @@ def _one_by_one(
         elif k < moving:
             values[:] = 1.0
         elif k < slow:
-            _respond(gaps.size, motion.a1, motion.a2, response, later, values)
+            _respond(
+                gaps.size, motion.denominator[0], motion.denominator[1], response, later, values
+            )
         else:
             # A slow response of the creep keeps a part of itself, and nothing of the sample before.
             keeping[:] = -lags[k - slow, 2]

@@ -26,7 +26,7 @@ def inner(**options: Any) -> Any:
 # Models side by side: four vector registers of eight numbers, which hide each other's latency.
 LANES = 32
 
-# A row of a struct; several rows are `Annotated[FloatArray, (number,)]`.
+# A row of a struct; several rows are `Annotated[FloatArray, (number,)]`, matrices of rows (2, 2).
 Row = Annotated[FloatArray, ()]
 
 # Structs (groups,) that Python fills.
@@ -67,8 +67,9 @@ class Struct:
             chosen = values[rows]
             if spare:
                 chosen = np.concatenate([chosen, np.repeat(chosen[-1:], spare, axis=0)])
-            lanes = chosen.reshape(groups, LANES, *chosen.shape[1:]).swapaxes(1, -1)
-            structs[name][:, : lanes.shape[1]] = lanes
+            lanes = chosen.reshape(groups, LANES, *chosen.shape[1:])
+            lanes = lanes.transpose(0, *range(2, lanes.ndim), 1)
+            structs[name][tuple(map(slice, lanes.shape))] = lanes
         return structs
 
 

@@ -29,11 +29,8 @@ class Motion(Struct):
     level: Row
     quadratic: Row
     cubic: Row
-    b0: Row
-    b1: Row
-    b2: Row
-    a1: Row
-    a2: Row
+    numerator: Annotated[FloatArray, (3,)]
+    denominator: Annotated[FloatArray, (2,)]
     x1: Row
     x2: Row
     equilibrium: Row
@@ -89,8 +86,7 @@ def physics(
         level = level + crept * np.sum(sections.gains[1:], axis=0)
         rows |= {"crept": crept, "strength": np.stack(sections.gains[1:], axis=1)}
     dynamics = sections.recursions[0]
-    rows |= dict(zip(("b0", "b1", "b2"), dynamics.numerator.T, strict=False))
-    rows |= dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
+    rows |= {"numerator": dynamics.numerator, "denominator": dynamics.denominator[:, 1:]}
     rows |= {"level": level}
     others = {"growth": "creep_growth", "quadratic": "quadratic", "cubic": "cubic"}
     return rows | {row: column[name] for row, name in others.items() if name in column}
@@ -108,9 +104,8 @@ def simulated(
     The displacement passes dynamics whose numerator is their denominator, which leave it as it is;
     free responses use the denominator alone.
     """
-    dynamics, rows = sections.recursions[0], {"level": first, "b0": np.ones_like(first)}
-    rows |= dict(zip(("b1", "b2"), dynamics.denominator.T[1:], strict=False))
-    return rows | dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
+    passing = sections.recursions[0].denominator
+    return {"level": first, "numerator": passing, "denominator": passing[:, 1:]}
 
 
 @inner()
@@ -137,7 +132,8 @@ def _bend(motion: Motion, curve: FloatArray, first: int, drive: FloatArray) -> N
 @inner(fastmath={"contract", "nsz"})
 def _follow(motion: Motion, drive: FloatArray) -> None:
     """Apply the dynamics."""
-    b0, b1, b2, a1, a2 = motion.b0, motion.b1, motion.b2, motion.a1, motion.a2
+    b0, b1, b2 = motion.numerator[0], motion.numerator[1], motion.numerator[2]
+    a1, a2 = motion.denominator[0], motion.denominator[1]
     level, x1, x2 = motion.level, motion.x1, motion.x2
     for t in range(len(drive)):
         for i in range(LANES):
