@@ -16,41 +16,31 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.model.linear import Creep, Filter, Lag, NoDynamics, SecondOrder
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.backlash_like import BacklashLike
-from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
-from bwbayes.model.operators.duhem import Duhem
-from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
-from bwbayes.model.operators.maxwell_slip import MaxwellSlip
-from bwbayes.model.operators.no_hysteresis import NoHysteresis
-from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
-from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
-from bwbayes.model.operators.preisach import Preisach
 from bwbayes.model.stage import Stage
-from bwbayes.model.stages.additions import Drift, OffsetStep, Oscillation, Transient
-from bwbayes.model.stages.backlash import Backlash
-from bwbayes.model.stages.delay import Delay
-from bwbayes.model.stages.gain import Heating, MovingGain, Temperature
-from bwbayes.model.stages.lags import AmplifierLag, SensorLag
-from bwbayes.model.stages.reversed_sign import ReversedSign
-from bwbayes.model.stages.saturation import Saturation
-from bwbayes.model.stages.sensor_curve import SensorCurve
-from bwbayes.model.stages.series_plays import SeriesPlays
-from bwbayes.model.stages.slew_limit import SlewLimit
+
+
+def imported(path: str) -> Any:
+    """Return what is at an import path, ``module:Class``."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
-    "bouc-wen": BoucWen,
-    "bouc-wen-asymmetric": BoucWenAsymmetric,
-    "backlash-like": BacklashLike,
-    "duhem": Duhem,
-    "prandtl-ishlinskii": PrandtlIshlinskii,
-    "plays": Plays,
-    "maxwell-slip": MaxwellSlip,
-    "preisach": Preisach,
-    "krasnoselskii-pokrovskii": KrasnoselskiiPokrovskii,
-    "jiles-atherton": JilesAtherton,
-    "domain-wall": DomainWall,
-    "linear": NoHysteresis,
+    name: imported(f"bwbayes.model.operators.{path}")
+    for name, path in {
+        "bouc-wen": "bouc_wen:BoucWen",
+        "bouc-wen-asymmetric": "bouc_wen_asymmetric:BoucWenAsymmetric",
+        "backlash-like": "backlash_like:BacklashLike",
+        "duhem": "duhem:Duhem",
+        "prandtl-ishlinskii": "prandtl_ishlinskii:PrandtlIshlinskii",
+        "plays": "prandtl_ishlinskii:Plays",
+        "maxwell-slip": "maxwell_slip:MaxwellSlip",
+        "preisach": "preisach:Preisach",
+        "krasnoselskii-pokrovskii": "krasnoselskii_pokrovskii:KrasnoselskiiPokrovskii",
+        "jiles-atherton": "pinned:JilesAtherton",
+        "domain-wall": "pinned:DomainWall",
+        "linear": "no_hysteresis:NoHysteresis",
+    }.items()
 }
 
 # Options of a hysteresis operator beside its name: all that any of them takes.
@@ -70,22 +60,25 @@ DYNAMICS: Mapping[str, Callable[..., Filter]] = {
 STAGES: Mapping[str, Callable[..., Stage]] = {
     stage.name: stage
     for stage in (
-        Delay,
-        AmplifierLag,
-        SlewLimit,
-        Saturation,
-        Temperature,
-        Heating,
-        MovingGain,
-        Backlash,
-        SeriesPlays,
-        SensorLag,
-        SensorCurve,
-        ReversedSign,
-        Drift,
-        Transient,
-        OffsetStep,
-        Oscillation,
+        imported(f"bwbayes.model.stages.{path}")
+        for path in (
+            "delay:Delay",
+            "lags:AmplifierLag",
+            "slew_limit:SlewLimit",
+            "saturation:Saturation",
+            "gain:Temperature",
+            "gain:Heating",
+            "gain:MovingGain",
+            "backlash:Backlash",
+            "series_plays:SeriesPlays",
+            "lags:SensorLag",
+            "sensor_curve:SensorCurve",
+            "reversed_sign:ReversedSign",
+            "additions:Drift",
+            "additions:Transient",
+            "additions:OffsetStep",
+            "additions:Oscillation",
+        )
     )
 }
 
@@ -104,13 +97,13 @@ def _maker_of[Part](
 ) -> Callable[..., Part]:
     if name in registry:
         return registry[name]
-    module, _, attribute = name.partition(":")
-    if not attribute:
+    if ":" not in name:
         raise InputError(f"{where}: {name!r} is unknown; {suggestion(name, registry)}")
     try:
-        maker: Callable[..., Part] = getattr(importlib.import_module(module), attribute)
+        maker: Callable[..., Part] = imported(name)
     except Exception as error:  # a module from outside may raise anything
         reason = f"{type(error).__name__}: {error}"
+        module = name.partition(":")[0]
         raise InputError(
             f"{where}: cannot import {name!r} ({reason}); write module:Class, and make sure that "
             f"`python -c 'import {module}'` works where you run this"
