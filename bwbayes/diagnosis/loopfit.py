@@ -142,6 +142,8 @@ def fit_loop(record: Record) -> LoopFit:
     added, degrees = basis.shape[1] - 4, max(centered.size - basis.shape[1] - 2, 1)
     ratio = (optimum.fun - remainder) / added / max(remainder / degrees, 1e-300)
     gain = float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300))
+    # White noise, by the median of differences: that of χ² of one degree of freedom is 0.4549.
+    white = float(np.median(np.diff(residual) ** 2)) / (2 * 0.4549)
     return LoopFit(
         rows[has_reading],
         residual,
@@ -160,7 +162,7 @@ def fit_loop(record: Record) -> LoopFit:
         - float(
             np.var(residual) / max(np.var(driven), (1 - trend_share) * np.var(centered), 1e-300)
         ),
-        max(float(np.var(residual) - _white(residual)), 0.0) / max(np.var(centered), 1e-300),
+        max(float(np.var(residual) - white), 0.0) / max(np.var(centered), 1e-300),
         float(scipy.stats.f.sf(ratio, added, degrees)),
         abs(gain) * float(imitated[-1]),
         abs(gain * (drift[-1] - drift[0])) * float(followed[-1]),
@@ -212,12 +214,6 @@ def find_delay(record: Record, limit: float) -> tuple[float, float]:
         lambda delay: missed(np.array([delay]))[0], bounds=between, method="bounded"
     )
     return float(optimum.x), float(optimum.fun)
-
-
-def _white(residual: FloatArray) -> float:
-    """Return the variance of the white noise in a residual, by the median of its differences."""
-    # The median of a χ² variable of one degree of freedom is 0.4549.
-    return float(np.median(np.diff(residual) ** 2)) / (2 * 0.4549)
 
 
 def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:

@@ -71,11 +71,11 @@ def exponent(scene: ResidualAnalysis) -> Iterator[Explanation]:
         prior = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
         starts = ({"exponent": -1.0}, {"exponent": 1.0})
         sighting = Sighting({"exponent": Stated(prior)}, starts)
-        yield from scene.changed("free exponent", _exponent_words, sighting=sighting)
 
+        def words(values: Mapping[str, float]) -> tuple[str, str]:
+            return f"transition of exponent {values['exponent']:.2g} instead of 1", ""
 
-def _exponent_words(values: Mapping[str, float]) -> tuple[str, str]:
-    return f"transition of exponent {values['exponent']:.2g} instead of 1", ""
+        yield from scene.changed("free exponent", words, sighting=sighting)
 
 
 def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanation]:

@@ -97,7 +97,8 @@ class StudentMixture:
         _require_spread(draws)
         maps, modes = [], []
         if guess is not None:
-            maps, modes = [*guess.maps], [guess._stand_ins(mode) for mode in guess._lesser]
+            lesser = [guess._modes.index(mode) for mode in range(1, max(guess._modes) + 1)]
+            maps, modes = [*guess.maps], [guess._stand_ins(first) for first in lesser]
         draws, log_slope = apply_maps(maps, draws)
         first = draws
         if guess is not None and modes:
@@ -257,11 +258,6 @@ class StudentMixture:
         """The mode of each component, (components,): components with one center are one mode."""
         centers = [tuple(center) for center in self.centers]
         return [list(dict.fromkeys(centers)).index(center) for center in centers]
-
-    @property
-    def _lesser(self) -> list[int]:
-        """The first component of each mode except the first mode."""
-        return [self._modes.index(mode) for mode in range(1, max(self._modes) + 1)]
 
     def _stand_ins(self, component: int) -> FloatArray:
         """Return points (points, free) that represent draws of a component.

@@ -31,10 +31,12 @@ def run_budgets(run: Run) -> tuple[Budget, ...]:
     study, draws, predictions = run.study, run.subset[::2], run.predictions
     posterior, instruments = study.posterior, study.record.instruments
     shown = next((bands for bands in predictions if not bands.training), predictions[0])
-    name = next(
-        (name for name in ("d", *posterior.names) if _is_actuators(posterior, name)),
-        posterior.names[0],
-    )
+    actuators = [
+        parameter.name
+        for parameter in posterior.prior.free
+        if parameter.declared.scope == "actuator" and parameter.name in posterior.table.physical
+    ]
+    name = "d" if "d" in actuators else [*actuators, *posterior.names][0]
     unit = next(p.unit for p in study.parameters if p.name == name)
     quantities = [
         Measurand(name, unit, draws[:, posterior.names.index(name)]),
@@ -42,13 +44,6 @@ def run_budgets(run: Run) -> tuple[Budget, ...]:
         _displacement(run, draws, shown),
     ]
     return uncertainty_budgets(posterior, draws, quantities, instruments, study.scales(len(draws)))
-
-
-def _is_actuators(posterior: Posterior, name: str) -> bool:
-    """Tell whether a name is that of a free parameter of the actuator."""
-    free = {p.name: p for p in posterior.prior.parameters if p.fixed is None}
-    physical = name in free and name in posterior.table.physical
-    return physical and free[name].declared.scope == "actuator"
 
 
 def _displacement(run: Run, draws: FloatArray, bands: Bands) -> Measurand:
