@@ -33,13 +33,15 @@ class LeadIn:
     """The stretch that told a record's start, and how well it fits.
 
     It goes from ``start`` to ``stop`` in s and holds ``samples`` readings; ``p_value`` is that of
-    a test of its innovations, small where the model cannot have made them.
+    a test of its innovations, small where the model cannot have made them. ``tells_offset`` says
+    that it told the record's own offset.
     """
 
     start: float
     stop: float
     samples: int
     p_value: float
+    tells_offset: bool = True
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,11 @@ which covers at least ``level`` of the next block's readings on average, whateve
 is like: conformal risk control (Angelopoulos et al., ICLR 2024, equation (4)), with the share that
 is missed for the risk. There is none with fewer than 19 blocks, and here with fewer than twenty.
 
-The blocks of one record do not show differences between records, such as an offset or an initial
-state that a lead-in has told badly: with these, the next record is covered less.
+A lead-in tells a record's offset from readings with the model's error, and the next record has
+another lead-in. So each block is judged about the means that lead-ins elsewhere in the record would
+have given, and F_j(f) is the mean over these. Other differences between records, such as an initial
+state that a lead-in has told badly, the blocks of one record do not show: with these, the next
+record is covered less.
 """
 
 from __future__ import annotations
@@ -31,9 +34,6 @@ def correct(bands: Bands) -> Correction:
     scored = bands.scored(bands.measured)
     residual = np.where(scored, bands.measured - bands.mean, 0.0)
     edges = [edge["sensor", 95] - bands.mean for edge in (bands.lower, bands.upper)]
-    half_width = np.where(residual < 0, -edges[0], edges[1])
-    # Each reading's own factor: how much wider the band has to be to reach it.
-    factors = np.abs(residual) / np.maximum(half_width, np.finfo(float).tiny)
 
     length = math.ceil(residual_memory(residual / np.maximum(bands.sd("sensor"), 1e-150), scored))
     blocks = _blocks(bands, scored, length)
@@ -41,13 +41,43 @@ def correct(bands: Bands) -> Correction:
     least = 20
     if len(blocks) < least:
         return Correction(None, len(blocks), block_s, least * block_s)
-    share = np.concatenate([np.full(rows.size, 1 / rows.size) for rows in blocks])
-    reached = factors[np.concatenate(blocks)]
+    shifts = _shifts(bands)
+    rows = np.concatenate(blocks)
+    share = np.concatenate([np.full(one.size, 1 / one.size / shifts.size) for one in blocks])
+    share = np.tile(share, shifts.size)
+    # Each reading's own factor: how much wider the band has to be to reach it.
+    away = (residual[rows] - shifts[:, np.newaxis]).ravel()
+    below, above = (np.tile(np.abs(edge[rows]), shifts.size) for edge in edges)
+    reached = np.abs(away) / np.maximum(np.where(away < 0, below, above), np.finfo(float).tiny)
     order = np.argsort(reached)
     # The share of all blocks inside, as the band grows; rounding must not ask for one reading more.
     inside = np.cumsum(share[order]) + 1e-9
     first = int(np.searchsorted(inside, 0.95 * (len(blocks) + 1)))
     return Correction(float(reached[order][first]), len(blocks), block_s)
+
+
+def _shifts(bands: Bands) -> FloatArray:
+    """Return by how much lead-ins elsewhere in the record would have moved the mean, um.
+
+    These are the means of the residual over stretches as long as the lead-in, which itself has
+    none; evenly along the record, a hundred or as many as memory allows.
+    """
+    assert bands.measured is not None
+    residual = bands.measured - bands.mean
+    if bands.lead_in is None or not bands.lead_in.tells_offset:
+        return np.zeros(1)
+    length = round((bands.lead_in.stop - bands.lead_in.start) / bands.interval)
+    count = min(max(10_000_000 // residual.size, 1), 100)
+    starts = np.linspace(0, max(residual.size - length, 0), count).astype(int)
+    known = np.isfinite(residual)
+    sums, counts = (
+        np.concatenate([[0.0], np.cumsum(values)])
+        for values in (np.where(known, residual, 0.0), known)
+    )
+    readings = (counts[length:] - counts[:-length])[starts]
+    totals = (sums[length:] - sums[:-length])[starts]
+    shifts: FloatArray = totals[readings > 0] / readings[readings > 0]
+    return shifts
 
 
 def residual_memory(z: FloatArray, scored: BoolArray) -> float:

@@ -379,6 +379,7 @@ def _informed(
         float(record.time[window.stop]),
         likelihood.readings.rows.size,
         _p_value(histories, theta, posterior.squares),
+        bool(offsets),
     )
     model = likelihood.table.actuator(start_theta)
     return InitialStates(histories, model, initial_transient, sd, lead_in, window.stop)

@@ -20,7 +20,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import InitialConditions
 from bwbayes.prediction import correction as module
-from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.bands import Bands, LeadIn
 from bwbayes.prediction.correction import correct, residual_memory
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
@@ -69,6 +69,27 @@ def test_corrected_bands_cover_the_next_record(monkeypatch: pytest.MonkeyPatch) 
     few = next_coverages(2.0)
     assert len(few) == 200
     assert np.mean(few) < 0.93
+
+
+def test_correction_counts_that_the_next_lead_in_tells_another_offset() -> None:
+    """Of a second, over which an error that forgets within 0.3 s is far from averaging out."""
+    lead_in, rng, covered = LeadIn(0.0, 1.0, 100, 0.5), np.random.default_rng(4), []
+
+    def led() -> Bands:
+        bands = narrow_bands(rng, 40.0)
+        assert bands.measured is not None
+        offset = np.mean((bands.measured - bands.mean)[:100])
+        return replace(bands, measured=bands.measured - offset, lead_in=lead_in, scored_from=100)
+
+    for _ in range(200):
+        held_out, after = led(), led()
+        same = replace(lead_in, tells_offset=False)
+        corrections = [correct(held_out), correct(replace(held_out, lead_in=same))]
+        if corrections[0].factor is not None:
+            covered.append([coverage(replace(after, correction=one)) for one in corrections])
+    counted, left_out = np.mean(covered, axis=0)
+    assert 0.945 < counted < 0.98
+    assert left_out < 0.945
 
 
 def test_factor_is_the_least_that_covers_enough_of_the_blocks() -> None:
