@@ -121,7 +121,7 @@ def _filtering(
     stationary, observe, states = noise.stationary(theta), noise.observe, noise.states
     variance = observe @ stationary @ observe
     unit = np.eye(states)
-    plain = np.all(observe == unit[:1]) and np.all(stationary == np.multiply.outer(variance, unit))
+    plain = (observe == unit[:1]).all() and (stationary == np.multiply.outer(variance, unit)).all()
     turned = None if plain else _observed_first(stationary, observe)
     size = max(states, 1)
     f_matrices, gained = np.zeros((2, len(theta), missing.size, size, size))
@@ -131,10 +131,7 @@ def _filtering(
             f = turned @ f @ np.linalg.inv(turned)
             q = turned @ q @ np.swapaxes(turned, 1, 2)
         f_matrices[:, gap], gained[:, gap] = f, q
-    return {"f": f_matrices, "q": gained}, {
-        "sensor": theta[:, 0] ** 2, "covariance": variance, "covariance_22": variance,
-        "ratio": np.ones(len(theta)), "change": np.full(len(theta), np.inf),
-    }  # fmt: skip
+    return {"f": f_matrices, "q": gained}, {"sensor": theta[:, 0] ** 2, "covariance": variance}
 
 
 def _responses(likelihood: Likelihood, free: FloatArray) -> tuple[Unknowns, dict[str, FloatArray]]:

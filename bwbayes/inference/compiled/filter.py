@@ -73,6 +73,14 @@ class Filter(Struct):
     products: Annotated[FloatArray, (SERIES * (SERIES + 1) // 2,)]
 
 
+@inner()
+def begin(state: Filter) -> None:
+    """Complete the state at the first reading, before which the covariance is stationary."""
+    for i in range(LANES):
+        state.covariance_22[i] = state.covariance[i]
+        state.ratio[i], state.change[i] = 1.0, np.inf
+
+
 @inner(fastmath={"contract", "nsz"})
 def follow(
     state: Filter,

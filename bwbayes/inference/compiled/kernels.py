@@ -167,6 +167,7 @@ def sums(
     decays, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
     for group in range(len(motions)):
         motion, state = motions[group], filters[group]
+        noise.begin(state)
         # Avoid literals, for which numba would compile the rest for a second time.
         now, pending = int(np.int64(0)), int(np.int64(0))
         staying, steady = 0, False

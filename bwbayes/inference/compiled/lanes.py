@@ -67,9 +67,11 @@ class Struct:
             chosen = values[rows]
             if spare:
                 chosen = np.concatenate([chosen, np.repeat(chosen[-1:], spare, axis=0)])
-            lanes = chosen.reshape(groups, LANES, *chosen.shape[1:])
-            lanes = lanes.transpose(0, *range(2, lanes.ndim), 1)
-            structs[name][tuple(map(slice, lanes.shape))] = lanes
+            lanes, filled = chosen.reshape(groups, LANES, *chosen.shape[1:]), structs[name]
+            if lanes.ndim > 2:
+                lanes = lanes.transpose(0, *range(2, lanes.ndim), 1)
+                filled = filled[tuple(map(slice, lanes.shape))]
+            filled[:] = lanes
         return structs
 
 
