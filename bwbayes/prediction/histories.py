@@ -86,7 +86,10 @@ class States:
             self.ordered = np.zeros((4, len(theta)))
             return
         actuator, span = likelihood.actuator, likelihood.actuator.range_of(likelihood.voltage)
-        column, voltage = self.table.columns(theta), float(likelihood.voltage[0])
+        column, inputs = self.table.columns(theta), likelihood.inputs
+        # As the stages before the hysteresis pass it on: a delay may be a quarter of a period.
+        memories = actuator.begin_inputs(column, inputs, from_rest=False)
+        voltage = float(np.mean(actuator.pass_inputs(column, inputs[:1], memories)[0]))
         low, high = actuator.hysteresis.reachable(column, voltage, span)
         self.ordered = np.stack([low, low, high, high])
         if single:

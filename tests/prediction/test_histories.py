@@ -12,6 +12,7 @@ import pytest
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Span
 from bwbayes.model.operators.scalar_memory import OneState
+from bwbayes.model.stages.delay import Delay
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.histories import States, choose_histories
 from bwbayes.prediction.initial_state import estimate_initial_states
@@ -137,6 +138,20 @@ def test_states_of_a_record_hold_those_after_any_drive() -> None:
     slack = 0.01 * np.ptp(states)
     assert states[0] - slack <= min(left)
     assert max(left) <= states[1] + slack
+
+
+def test_states_are_of_the_voltage_that_the_hysteresis_sees() -> None:
+    """A voltage that is late by 100 samples: those of a record that begins 100 samples later."""
+    posterior = posterior_of_case(Case())
+    likelihood = posterior.altered(voltage=np.linspace(-50.0, 100.0, 400)).likelihood
+    actuator = replace(likelihood.actuator, span=Span(-100.0, 100.0))
+    likelihood = replace(likelihood, actuator=actuator, from_rest=False)
+    late = replace(likelihood, actuator=replace(actuator, stages=(Delay(),)))
+    theta = posterior.prior.theta(np.empty((1, 0)))
+    column = {**likelihood.table.columns(theta), "delay": np.array([-100 * actuator.interval])}
+    shifted = np.stack([column[name] for name in late.table.names], axis=1)
+    later = States(replace(likelihood, inputs=likelihood.inputs[100:]), theta, single=True)
+    np.testing.assert_allclose(States(late, shifted, single=True).ordered, later.ordered)
 
 
 def level_error(seed: int) -> tuple[float, float]:
