@@ -19,6 +19,7 @@ from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.loopfit import find_delay
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis, Sighting
 from bwbayes.diagnosis.series_patterns import strongest_line
+from bwbayes.inference.posterior import FARTHEST_FOLLOWED
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import Distribution, normal
 from bwbayes.model.registry import STAGES
@@ -167,10 +168,11 @@ class _LongDelay(_Delay):
         prior = Delay.parameters[0].default(scene.study.contexts[""])
         assert isinstance(prior, Distribution)
         sd = prior.arguments["sd"]
+        limit = FARTHEST_FOLLOWED * sd
         kept = np.full(record.displacement.size, np.nan)
         for window in record.training:
             kept[window] = record.displacement[window]
-        late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), 2.2 * sd)
+        late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), limit)
         rows = round(late / scene.interval)
         if abs(late) < max(scene.turn_time / 50, scene.interval / scene.stride) or not rows:
             return

@@ -25,6 +25,9 @@ from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.shown import brief
 
+# Normal scores of the priors' models, 97% of them, whose readings are fitted.
+FARTHEST_FOLLOWED = 2.2
+
 
 class RecordView(NamedTuple):
     """One of a posterior's records: its own posterior, and its parameters of some draws.
@@ -227,8 +230,9 @@ class Posterior:
         return replace(self, datasets=(replace(self.single_record, **fields),))
 
     def known(self) -> Posterior:
-        """Return the posterior of those readings that 95% of the prior's models can follow."""
-        ends = [p.distribution.form.value(np.array([-1.96, 1.96])) for p in self.prior.free]
+        """Return the posterior of those readings that 97% of the prior's models can follow."""
+        scores = FARTHEST_FOLLOWED * np.array([-1.0, 1.0])
+        ends = [p.distribution.form.value(scores) for p in self.prior.free]
         theta = self.prior.theta(np.stack(ends, axis=1))
         displacements = {}
         for dataset in self.datasets:
