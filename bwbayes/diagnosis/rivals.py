@@ -3,12 +3,13 @@
 If a model's residual follows the drive (:mod:`bwbayes.diagnosis.drive_lock`), the record does not
 show its size on another drive. Models of other families that fit the record about as well show how
 large it may be: another operator, the nonlinearity elsewhere on the signal's path, with creep or
-without. If all of them agree on a drive, their differences do not matter there.
+without. If it does not, there may be models still for which the record has as much evidence. If all
+of them agree on a drive, their differences do not matter there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -84,9 +85,12 @@ def families(spec: ModelSpec) -> Iterator[ModelSpec]:
 
 
 def fit_rivals(
-    study: Study, rng: np.random.Generator, watch: Watch = unwatched
+    study: Study,
+    specs: Iterable[ModelSpec],
+    rng: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> tuple[Rival, ...]:
-    """Fit a rival of each family to a study's record, or to some thousand readings of a long one.
+    """Fit rivals to a study's record, or to some thousand readings of a long one.
 
     Each starts from the values of the parameters that it shares with the model, and from its own
     local minimum. ``watch`` is called with the share that is done.
@@ -97,7 +101,7 @@ def fit_rivals(
     stride = stride_of(thin_posterior(posterior_full, theta, READINGS), posterior_full)
     known_values = dict(zip(posterior_full.names, origin.tolist(), strict=True))
     rivals = []
-    for spec in watched([*families(study.spec)], watch):
+    for spec in watched([*specs], watch):
         # Leave out a model that needs a prior that is not stated.
         with suppress(InputError):
             posterior = study.with_model(spec).posterior

@@ -182,9 +182,9 @@ class Bands:
             return ""
         width, before = self.width(), self.without_rivals.width()
         return (
-            f"model error that follows the drive: bands widened {width / before:.2g} times on this "
-            f"one (95% sensor band {width:.2g} um wide instead of {before:.2g} um), because other "
-            f"models of the training record differ by {self.model_error_sd:.2g} um more here"
+            f"bands widened {width / before:.2g} times on this one (95% sensor band {width:.2g} um "
+            f"wide instead of {before:.2g} um), because other models of the training record differ "
+            f"by {self.model_error_sd:.2g} um more here"
         )
 
     @property

@@ -487,8 +487,8 @@ def rivals_table(predictions: Iterable[Bands]) -> list[Table]:
         rows.append((bands.name, *widths, *shares))
     columns = ("Record", "Width 95%", "Without rivals", "Times", "Coverage", "Without rivals")
     note = (
-        "The model's error follows the drive, and these drives are unlike the training record's: "
-        "there the sensor band has in it how much other models of the training record differ."
+        "These drives are unlike the training record's: there the sensor band has in it how much "
+        "other models of the training record differ."
     )
     table = Table("rivals", "Bands with and without rivals", columns, rows, note=note, on="both")
     return [table] * bool(rows)

@@ -353,17 +353,19 @@ def test_what_is_no_record_is_one_line(record: Record) -> None:
 def test_rivals_are_fitted_once_and_kept_with_the_run(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def rivals(p_value: float) -> tuple[Rival, ...] | None:
-        lock = DriveLock(0.5, p_value)
-        return (
-            bw.open_run(copy.path)
-            .with_cache(drive_locks={"record": lock})
-            .widening_rivals("record")
-        )
+    def rivals(p_value: float, **keys: Any) -> tuple[Rival, ...] | None:
+        """Return those of a run; other ``keys`` are of its [model]."""
+        lock, run = DriveLock(0.5, p_value), bw.open_run(copy.path)
+        model = run.config.model.model_copy(update=keys)
+        config = run.config.model_copy(update={"model": model})
+        locked = run.with_cache(config=config, drive_locks={"record": lock})
+        return locked.widening_rivals("record")
 
     copy.rivals.unlink(missing_ok=True)
     assert rivals(1.0) is None
     assert not copy.rivals.exists()
+    (tied,) = rivals(1.0, tied=[{"stages": ["sensor-lag"]}]) or ()
+    assert "sensor-lag" in tied.spec.chain
     fitted = rivals(0.0)
     # Fitting again would raise.
     monkeypatch.setattr("bwbayes.diagnosis.rivals.fit_rivals", None)

@@ -31,6 +31,7 @@ from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import InputWarning
 from bwbayes.inference import map_estimate as pointfit, mode_finding
 from bwbayes.inference.study import InitialConditions
+from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import plant
@@ -381,3 +382,24 @@ def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:
     again = Console(file=io.StringIO(), width=200)
     resume(folder, again, workers=1, steps=100, files=False)
     assert "noise:" not in again.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_models_that_tie_keep_what_the_search_did_later() -> None:
+    """A stage that tied stands in the place of the one chosen; one that was left out is not back.
+
+    A model with the same stages, but for another hold, is no other model.
+    """
+    base = ModelSpec()
+    chosen = base.with_stages("amplifier-lag")
+    others = [
+        base.with_stages("sensor-lag"),
+        base.with_stages("duhem"),
+        replace(chosen, hold="zero"),
+    ]
+    ended = chosen.with_stages("backlash")
+    tied = [spec.chain for spec in explaining._tied(ended, [(chosen, others)])]
+    assert tied == [("bouc-wen", "lag", "backlash", "sensor-lag"), ("duhem", "lag", "backlash")]
+    (left,) = explaining._tied(
+        base.with_stages("cubic"), [(base, [base.with_stages("cubic", "drift")])]
+    )
+    assert "drift" in left.chain

@@ -79,7 +79,9 @@ class Rivals:
     def __call__(self, of: str, _: object) -> tuple[Rival, ...] | None:
         """Return them, or None."""
         if self.locked and self.fitted is None:
-            self.fitted = fit_rivals(self.study.for_record(of), generator(1, "rivals"))
+            self.fitted = fit_rivals(
+                self.study.for_record(of), families(self.study.spec), generator(1, "rivals")
+            )
         return self.fitted
 
 

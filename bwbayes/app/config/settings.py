@@ -8,7 +8,7 @@ A key is a field here and nowhere else: its type is what is checked, its docstri
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
@@ -226,6 +226,9 @@ class ModelConfig(ActuatorConfig):
     """Longest time of the search for stages, as in 60s or 2min; none: no search."""
     unexplained: float | None = key(None, unit="SDs of the sensor's noise", example="0.9")
     """The model error left by a search that did not find the mechanism; such a run is inconclusive.
+    """
+    tied: list[dict[str, Any]] = key([], example='[{ stages = ["sensor-lag"] }]')
+    """Changes of these keys with which the record is as probable: unlike drives tell such models.
     """
     noise: str = key("auto", example='"smooth"')
     """The model of the residual; auto: the one that the records have evidence for."""

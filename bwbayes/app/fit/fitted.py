@@ -25,6 +25,7 @@ from bwbayes.app.fit.stage import RunStage, always
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.verbs import VERBS
 from bwbayes.errors import InputError, NotConvergedError, Renamed
+from bwbayes.model.spec import ModelSpec
 from bwbayes.quantities import DEFAULT
 from bwbayes.report.report import Shown
 from bwbayes.sampling.chain import PHASES, draws, log_densities
@@ -355,28 +356,42 @@ class Run(Shown):
         return drive_locks(self.study.posterior, self.subset, source)
 
     def rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...]:
-        """Return rivals of the model on a training record, by its name.
+        """Return rivals of other families on a training record, by its name.
 
         They are fitted when first needed, and kept in the folder. ``watch`` is called with the
         share that is done.
         """
+        from bwbayes.diagnosis.rivals import families
+
+        return self._rivals(of, tuple(families(self.study.spec)), watch)
+
+    def _rivals(self, of: str, specs: tuple[ModelSpec, ...], watch: Watch) -> tuple[Rival, ...]:
         from bwbayes.app.running.fingerprint import fingerprint, load, save
         from bwbayes.diagnosis.rivals import fit_rivals
 
         study, path, state = self.study, self.folder.rivals, fingerprint(self)
         fitted = load(path, state) or {}
-        if of not in fitted:
+        of_record = fitted.setdefault(of, {})
+        if specs not in of_record:
             rng = study.generator(f"rivals of {study.records[of].sha256}")
-            fitted[of] = fit_rivals(study.for_record(of), rng, watch)
+            of_record[specs] = fit_rivals(study.for_record(of), specs, rng, watch)
             # A process that predicts elsewhere may have no right to write to the folder.
             with suppress(OSError):
                 save(path, state, fitted)
-        rivals: tuple[Rival, ...] = fitted[of]
+        rivals: tuple[Rival, ...] = of_record[specs]
         return rivals
 
     def widening_rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...] | None:
-        """Return the rivals; None unless the model's error of that record follows the drive."""
-        return self.rivals(of, watch) if self.drive_locks[of].locked else None
+        """Return the models whose differences widen bands of unlike drives; None without any.
+
+        Where the model's error of that record follows the drive they are those of other families,
+        else those for which the record has as much evidence.
+        """
+        if self.drive_locks[of].locked:
+            return self.rivals(of, watch)
+        keys = self.study.spec.keys
+        tied = [ModelSpec.from_keys(keys | changes) for changes in self.config.model.tied]
+        return self._rivals(of, tuple(tied), watch) if tied else None
 
     @RunStage
     def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:

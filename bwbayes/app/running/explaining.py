@@ -11,7 +11,7 @@ while the fit follows what the actuator did not do: no stage mends a transient.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -33,6 +33,7 @@ from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Study
+from bwbayes.model.spec import ModelSpec
 from bwbayes.shown import rounded
 from bwbayes.watching import Watch, WatchSteps, part, parts, unwatched
 
@@ -192,6 +193,7 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
         return ChosenModel(run, point, (), None)
     (name,) = run.study.records
     notes, steps = dict[str, str](), list[str]()
+    ties = dict[str, tuple[ModelSpec, list[ModelSpec]]]()
     while True:
         step = partial(watch, f"stages, round {len(steps) + 1}")
         scene = _scene(run.study, name, point.optima)
@@ -204,7 +206,7 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
         parts = likely_causes([cause for cause in models if not cause.misleads])
         if needless:
             chosen = max(needless, key=lambda removal: removal.nats)
-            del notes[chosen.kind]
+            del notes[chosen.kind], ties[chosen.kind]
             note = f"left out again: {chosen.kind}"
         elif parts and all(cause.spec is not None for cause in followed_causes(explanations)):
             # A tie goes to a stage before another hold, then to the fewest parameters.
@@ -213,6 +215,8 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
             gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
             notes[added], note = f"stage added: {gain}", f"added: {gain}"
+            others = [cause.spec for cause in parts if cause.spec and cause is not chosen]
+            ties[added] = chosen.spec, others
         else:
             break
         steps.append(f"{note}, {clock():.0f} s")
@@ -240,9 +244,32 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
         )
     spec = run.study.spec
     run = with_model(
-        run, spec, remarks=remarks, stages=spec.keys["stages"], unexplained=unexplained
+        run,
+        spec,
+        remarks=remarks,
+        stages=spec.keys["stages"],
+        unexplained=unexplained,
+        tied=[spec.changes_to(other) for other in _tied(spec, ties.values())],
     )
     return ChosenModel(run, point, tuple(steps), None if is_over else {name: explanations})
+
+
+def _tied(
+    spec: ModelSpec, ties: Iterable[tuple[ModelSpec, Sequence[ModelSpec]]]
+) -> Iterator[ModelSpec]:
+    """Yield models with a stage that tied with one that was chosen, and all later changes.
+
+    ``ties`` are models that were chosen, and those that tied with them. A model with the same
+    stages predicts the same.
+    """
+    for chosen, others in ties:
+        later = [stage for stage in spec.stages if stage not in chosen.stages]
+        gone = {stage.name for stage in chosen.stages if stage not in spec.stages}
+        for other in others:
+            tied = other.without(*gone.intersection(other.chain) - {other.operator.name})
+            tied = replace(tied.with_stages(*later), hold=spec.hold, noise=spec.noise)
+            if tied.chain != spec.chain:
+                yield tied
 
 
 def _size(study: Study, cause: Explanation) -> tuple[bool, int]:

@@ -2,9 +2,9 @@
 
 :func:`predictions` predicts what a config names, :func:`predict_another` any record or planned
 voltage, :func:`predict_after` what follows on a training record; what comes of them is judged by
-the readings, if there are any. Where the model's error follows the drive, its rivals widen the
-bands of unlike drives. Random numbers hang on the data alone: the same record under another name
-gets the same bands.
+the readings, if there are any. Rivals of the model, if it has any, widen the bands of unlike
+drives, by what they differ from the model as it was fitted. Random numbers hang on the data alone:
+the same record under another name gets the same bands.
 """
 
 from __future__ import annotations
@@ -366,7 +366,8 @@ def predict_after(
         def follow(posterior: Posterior, draws: FloatArray) -> Bands:
             return forecast(posterior, draws, record, voltage, rng)
 
-        error = disagreement(alone, own_draws, study.for_record(of), rivals, follow, rng)
+        fitted = study.posterior.for_record(of), study.posterior.select_draws(run.subset, of)
+        error = disagreement(*fitted, study.for_record(of), rivals, follow, rng)
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     bands = forecast(alone, own_draws, record, voltage, source, name, predicting, error)
     bands = replace(bands, correction=_of_drives_alike(run, held_out, beyond))
@@ -418,7 +419,8 @@ def _of_another(
         def predict(posterior: Posterior, draws: FloatArray) -> Bands:
             return predict_record(posterior, draws, record, other.start, rng)
 
-        error = disagreement(alone, own_draws, study.for_record(other.of), rivals, predict, rng)
+        fitted = study.posterior.for_record(other.of), study.posterior.select_draws(draws, other.of)
+        error = disagreement(*fitted, study.for_record(other.of), rivals, predict, rng)
     source = study.generator(f"predict {record.sha256}")
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     return predict_record(
