@@ -191,7 +191,7 @@ def _keys_of(name: str, base: ModelConfig) -> dict[str, Any]:
     spec = ModelSpec(core).with_stages(*(word for word in words if word in stages))
     noise = " + ".join(word for word in words if word in noises)
     # The course of the voltage and what was before are of the record, not of a model.
-    kept = {"hold": base.hold, "history": base.history}
-    # A search for another model's stages found these.
-    found = {"unexplained": None, "tied": []}
-    return dict.fromkeys(OPTIONS) | spec.keys | kept | found | {"noise": noise or base.noise}
+    kept: dict[str, Any] = {"hold": base.hold, "history": base.history}
+    # A search found these of the base.
+    kept |= {"unexplained": None, "tied": []}
+    return dict.fromkeys(OPTIONS) | spec.keys | kept | {"noise": noise or base.noise}
