@@ -15,8 +15,8 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, whitening
-from bwbayes.inference.compiled.filter import PAIR, Filter, Step
-from bwbayes.inference.compiled.kernels import Readings, Unknowns
+from bwbayes.inference.compiled.filter import PAIR, FilterState, Transition
+from bwbayes.inference.compiled.kernels import RecordArrays, Unknowns
 from bwbayes.inference.compiled.lanes import apart
 from bwbayes.inference.compiled.motion import Motion, Shared, physics, simulated
 from bwbayes.inference.compiled.stages import CompiledDrive, Given, advance_of, prepared
@@ -59,7 +59,7 @@ def products(
     # If readings are few, a pass over all samples takes longer than whitening the readings.
     if noise.states > LANE_STATES or (is_known and 2 * readings.rows.size < readings.samples):
         return likelihood.products_of_series(theta, np.empty((0, readings.rows.size)), displacement)
-    record = Readings(likelihood.inputs_read.voltage, likelihood.values, gaps)
+    record = RecordArrays(likelihood.inputs_read.voltage, likelihood.values, gaps)
     column = likelihood.table.columns(theta)
     sections, series = actuator.sections(column), 1 + likelihood.unknowns
     steps, filtering = _filtering(noise, likelihood.table.noise(theta), readings.gaps[0])
@@ -75,8 +75,8 @@ def products(
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = source.models.equilibrium
         named = make(actuator, sections, column, equilibrium, record.voltage)
-        over = Step.filled(steps, rows, readings.gaps[0].size)
-        filters = Filter.filled(filtering | responses, rows)
+        over = Transition.filled(steps, rows, readings.gaps[0].size)
+        filters = FilterState.filled(filtering | responses, rows)
         filters["step"] = over[:, 0]
         motions = Motion.filled(named, rows)
         kernels.sums(record, *source, shared, motions, filters, over, second, unknowns)

@@ -35,14 +35,14 @@ HIGH = np.maximum.outer(ORDER, ORDER)
 PAIR = HIGH * (HIGH + 1) // 2 + np.minimum.outer(ORDER, ORDER)
 
 
-class Step(Struct):
+class Transition(Struct):
     """The filter's step from a reading to the next."""
 
     f: Matrix
     q: Matrix
 
 
-class Filter(Struct):
+class FilterState(Struct):
     """Numbers and memory of the filter.
 
     Each series has a value, estimates of both states of the noise and an innovation; a response
@@ -51,7 +51,7 @@ class Filter(Struct):
     those of Q₁₁ + s².
     """
 
-    step: Step
+    step: Transition
     sensor: Row
     covariance: Row
     covariance_12: Row
@@ -74,7 +74,7 @@ class Filter(Struct):
 
 
 @inner()
-def begin(state: Filter) -> None:
+def begin(state: FilterState) -> None:
     """Complete the state at the first reading, before which the covariance is stationary."""
     for i in range(LANES):
         state.covariance_22[i] = state.covariance[i]
@@ -83,7 +83,7 @@ def begin(state: Filter) -> None:
 
 @inner(fastmath={"contract", "nsz"})
 def follow(
-    state: Filter,
+    state: FilterState,
     second: bool | None,
     readings: FloatArray,
     displacement: FloatArray,
@@ -129,7 +129,7 @@ def follow(
 
 @inner(error_model="numpy")
 def _fold(
-    state: Filter,
+    state: FilterState,
     second: bool | None,
     samples: int,
     weight: FloatArray,
@@ -170,7 +170,7 @@ def _fold(
 
 
 @inner(error_model="numpy")
-def _parts(state: Filter, second: bool | None, i: int, rho: float) -> tuple[float, float]:
+def _parts(state: FilterState, second: bool | None, i: int, rho: float) -> tuple[float, float]:
     """Return c and c₂, the ratios of both estimates to a response that keeps ρ of itself."""
     step = state.step
     gain, first = float(state.gain[i]), rho - step.f[0, 0, i]
@@ -183,7 +183,9 @@ def _parts(state: Filter, second: bool | None, i: int, rho: float) -> tuple[floa
 
 
 @inner(error_model="numpy")
-def is_tracked(state: Filter, second: bool | None, decays: FloatArray, series: IntArray) -> bool:
+def is_tracked(
+    state: FilterState, second: bool | None, decays: FloatArray, series: IntArray
+) -> bool:
     """Tell whether the estimates of all these responses are proportional to them, to rounding."""
     for k in range(series.size):
         at = series[k]
@@ -199,7 +201,7 @@ def is_tracked(state: Filter, second: bool | None, decays: FloatArray, series: I
 
 
 @inner()
-def is_heard(state: Filter, series: int) -> bool:
+def is_heard(state: FilterState, series: int) -> bool:
     """Tell whether the unknown initial state still matters to any model in one of its series.
 
     A response below 10⁻¹⁸ of its initial size adds nothing. A response that no longer matters is
@@ -218,7 +220,7 @@ def is_heard(state: Filter, series: int) -> bool:
 
 
 @inner()
-def is_settled(state: Filter) -> bool:
+def is_settled(state: FilterState) -> bool:
     """Tell whether the last reading changed no model's covariance, except for rounding."""
     settled = True
     for i in range(LANES):
@@ -228,7 +230,7 @@ def is_settled(state: Filter) -> bool:
 
 @inner(error_model="numpy")
 def gain(
-    state: Filter,
+    state: FilterState,
     second: bool | None,
     gaps: IntArray,
     steps: Structs,
@@ -296,7 +298,7 @@ def innovate(
 
 
 @inner(error_model="numpy")
-def _advance(state: Filter, second: bool | None) -> None:
+def _advance(state: FilterState, second: bool | None) -> None:
     """Advance the covariance to the next reading, and write the gain of this one."""
     step, sensors, change = state.step, state.sensor, state.change
     covariance, covariance_12 = state.covariance, state.covariance_12
@@ -324,7 +326,7 @@ def _advance(state: Filter, second: bool | None) -> None:
 
 
 @inner(error_model="numpy")
-def _predict(state: Filter, second: bool | None, step: Step) -> None:
+def _predict(state: FilterState, second: bool | None, step: Transition) -> None:
     """Advance the covariance by a step."""
     covariance, covariance_12 = state.covariance, state.covariance_12
     covariance_22 = state.covariance_22
@@ -343,7 +345,7 @@ def _predict(state: Filter, second: bool | None, step: Step) -> None:
 
 
 @inner()
-def _take_logs(state: Filter) -> None:
+def _take_logs(state: FilterState) -> None:
     """Move the product of variances to the sum of logs, before it gets too large."""
     for i in range(LANES):
         state.log[i] += math.log(state.ratio[i])
@@ -351,7 +353,7 @@ def _take_logs(state: Filter) -> None:
 
 
 @inner()
-def gather(state: Filter, readings: int) -> None:
+def gather(state: FilterState, readings: int) -> None:
     """Add the contributions of so many readings with one variance to the sums."""
     if readings == 0:
         return

@@ -23,13 +23,13 @@ from numba import float64, from_dtype, int64, none, types
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import filter as noise
 from bwbayes.inference.compiled.caching import compile_cached
-from bwbayes.inference.compiled.filter import SERIES, Filter, Step
+from bwbayes.inference.compiled.filter import SERIES, FilterState, Transition
 from bwbayes.inference.compiled.lanes import LANES, Structs, inner
 from bwbayes.inference.compiled.motion import PIECE, Motion, Shared, displace
 from bwbayes.inference.compiled.stages import Models, Owner, drive_of
 
 
-class Readings(NamedTuple):
+class RecordArrays(NamedTuple):
     """A record (samples,): voltage, V, and displacement, um.
 
     ``gaps`` has the index of the gap just before a reading: −1 at a sample without a reading, 0
@@ -52,7 +52,7 @@ class Unknowns(NamedTuple):
 @inner()
 def _one_by_one(
     motion: Motion,
-    state: Filter,
+    state: FilterState,
     second: bool | None,
     readings: FloatArray,
     gaps: IntArray,
@@ -134,7 +134,7 @@ def _add_products(
 
 @compile_cached(error_model="numpy")
 def sums(
-    record: Readings,
+    record: RecordArrays,
     owner: Owner,
     models: Models,
     shared: Shared,
@@ -151,12 +151,12 @@ def sums(
     record, owner, models
         The readings; a stage's formula and models (:mod:`bwbayes.inference.compiled.stages`).
     shared, motions, filters
-        Constants of all models, and structs (groups,) of :class:`Motion` and :class:`Filter`. The
-        series are the residual (um), the offset's response if it is unknown, free responses of the
-        dynamics and those of the creep.
+        Constants of all models, and structs (groups,) of :class:`Motion` and :class:`FilterState`.
+        The series are the residual (um), the offset's response if it is unknown, free responses of
+        the dynamics and those of the creep.
     steps
-        Structs (groups, gaps) of the filter's :class:`Step` over what is missing in each gap; the
-        first is the step from one reading to the next.
+        Structs (groups, gaps) of the filter's :class:`Transition` over what is missing in each gap;
+        the first is the step from one reading to the next.
     second
         None unless the noise has two states.
     """
@@ -218,7 +218,9 @@ def compile_common() -> bool:
     operator. Returns whether all were cached already.
     """
     flat, table, integers = float64[::1], float64[:, ::1], int64[::1]
-    motion, state, step = (from_dtype(struct.layout) for struct in (Motion, Filter, Step))
+    motion, state, step = (
+        from_dtype(struct.layout) for struct in (Motion, FilterState, Transition)
+    )
     shared = types.NamedTuple((table, table, flat), Shared)  # type: ignore[no-untyped-call]
     unknowns = types.NamedUniTuple(int64, 3, Unknowns)  # type: ignore[no-untyped-call]
     _one_by_one.compile(

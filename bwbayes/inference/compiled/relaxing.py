@@ -22,7 +22,7 @@ series, third = compiled(formulas.series), compiled(formulas.third)
 relaxed = compiled(formulas.relaxed)
 
 
-class Loops(Struct):
+class LoopState(Struct):
     """Numbers and memory of models.
 
     The rates that apply, of those for falling and rising voltages below zero and above (``pair``),
@@ -47,7 +47,7 @@ class Loops(Struct):
 
 
 class Relaxing(NamedTuple):
-    """Structs (groups,) of :class:`Loops`, and w₀ (models,), um.
+    """Structs (groups,) of :class:`LoopState`, and w₀ (models,), um.
 
     Also whether f or a of any model is curved, and whether a rate depends on a sign.
     """
@@ -66,7 +66,7 @@ class Relaxing(NamedTuple):
         fastest = np.abs(rates).max(axis=1)
         named = {"rest": rest, "h": h, "d": d, "alpha": alpha, "rates": rates, "fastest": fastest}
         named |= {"against": rates[:, 0], "ahead": rates[:, 4]}
-        return cls(Loops.filled(named), rest, step.curved, step.signed)
+        return cls(LoopState.filled(named), rest, step.curved, step.signed)
 
 
 @inner()
@@ -101,7 +101,7 @@ def relaxing(
 
 
 @inner()
-def _take(loops: Loops, before: float, u: float) -> None:
+def _take(loops: LoopState, before: float, u: float) -> None:
     """Select the rates that apply between two voltages."""
     pair = 2 * int(u > before) + int(before + u > 0.0)
     if loops.pair[0] == pair:
@@ -113,7 +113,7 @@ def _take(loops: Loops, before: float, u: float) -> None:
 
 
 @inner()
-def _move(loops: Loops, before: float, u: float, steepest: float, curved: bool) -> None:
+def _move(loops: LoopState, before: float, u: float, steepest: float, curved: bool) -> None:
     """Move h along a step on which the voltage keeps its sign, and write w − w₀."""
     s, v = 1.0 if u > before else -1.0, abs(u - before)
     short = v * steepest <= (BENT if curved else SHORT)
@@ -126,7 +126,7 @@ def _move(loops: Loops, before: float, u: float, steepest: float, curved: bool) 
 
 
 @inner(fastmath={"contract", "nsz"})
-def _straight(loops: Loops, s: float, u: float, v: float, short: bool) -> int:
+def _straight(loops: LoopState, s: float, u: float, v: float, short: bool) -> int:
     """Move h along a step, with φ₁ known or z small; return how many models passed zero."""
     h, d, alpha, rest = loops.h, loops.d[0], loops.alpha[0], loops.rest
     against, ahead, phi_1 = loops.against, loops.ahead, loops.phi_1
@@ -146,7 +146,7 @@ def _straight(loops: Loops, s: float, u: float, v: float, short: bool) -> int:
 
 
 @inner()
-def _cross(loops: Loops, s: float, u: float, v: float) -> None:
+def _cross(loops: LoopState, s: float, u: float, v: float) -> None:
     """Redo the models whose g passed zero within the step, where its rate changes."""
     d, alpha = loops.d[0], loops.alpha[0]
     for i in range(LANES):
@@ -158,7 +158,7 @@ def _cross(loops: Loops, s: float, u: float, v: float) -> None:
 
 
 @inner(fastmath={"contract", "nsz"})
-def _bend(loops: Loops, s: float, before: float, u: float, v: float, short: bool) -> None:
+def _bend(loops: LoopState, s: float, before: float, u: float, v: float, short: bool) -> None:
     """Move h along a step with one rate and a strength that changes, with φ known or z small."""
     hs, ahead, rest, w = loops.h, loops.ahead, loops.rest, loops.w
     d, d2, d3 = loops.d[0], loops.d[1], loops.d[2]
@@ -180,7 +180,7 @@ def _bend(loops: Loops, s: float, before: float, u: float, v: float, short: bool
 
 
 @inner(fastmath={"contract", "nsz"})
-def _phi(loops: Loops, s: float, v: float, steepest: float, curved: bool) -> None:
+def _phi(loops: LoopState, s: float, v: float, steepest: float, curved: bool) -> None:
     """Work out φ₁, and φ₂ and φ₃ if they are needed, by their series and doublings of z.
 
     φ₁(−2z) = φ₁ (1 + e⁻ᶻ)/2, φ₂(−2z) = (φ₁² + 2 φ₂)/4, φ₃(−2z) = (φ₁ φ₂ + φ₂ + 2 φ₃)/8.
