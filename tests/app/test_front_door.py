@@ -110,6 +110,16 @@ def resolved(path: Path, naming: Naming | None = None) -> Run:
     periods=5.0,
     seed=200,
 )  # no jump at its third sample
+@example(
+    samples=300,
+    rate=56_234.1,
+    start=1.7e9,
+    units=("s", "V", "um"),
+    separator=",",
+    kind="sine",
+    periods=5.0,
+    seed=1,
+)  # 1.778e-5 s is not the interval
 def test_any_ordinary_record_gets_a_config_that_resolves(
     tmp_path: Path,
     samples: int,
@@ -129,7 +139,8 @@ def test_any_ordinary_record_gets_a_config_that_resolves(
     problem = resolved(path)
     record = problem.study.record
     assert (samples, samples) == (record.samples, record.readings)
-    rounded = np.spacing(abs(start) + samples / rate)  # of the times in the file
+    scale = UNITS["time"][units[0]]
+    rounded = scale * np.spacing((abs(start) + samples / rate) / scale)  # of the times in the file
     assert record.interval == pytest.approx(1 / rate, rel=1e-4, abs=2 * rounded / (samples - 1))
     np.testing.assert_allclose(record.voltage, voltage, rtol=1e-8, atol=1e-9)
     fitted = np.concatenate([np.r_[w] for w in problem.study.posterior.single_record.training])

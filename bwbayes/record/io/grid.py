@@ -111,7 +111,8 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
         raise table.error(problem, "time")
     require_plausible(table, interval, elapsed.size)
     # Rounding error of a number of the time column in memory, s.
-    rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0
+    unit = np.spacing(np.abs(column.values).max()) if is_float else 0.0
+    rounding = float(column.scaled(np.array(unit, dtype=np.float64), "time"))
     is_repeat = np.append(False, steps == 0)
     is_copy = is_repeat.copy()
     for name in table.columns:
@@ -343,7 +344,7 @@ def _nearest_grid(
         sources = order[index]
     scatter = float(away.max())
     # The interval is as exact as three standard errors of the line's slope.
-    unsure = 1.5 * scatter / math.sqrt(elapsed.size)
+    unsure = 3 * scatter / math.sqrt(elapsed.size)
     interval = _exact_interval(table, interval, scatter, unsure, int(np.ptp(positions)))
     remark = f"irregular sampling: samples are moved by up to {scatter:.2g} s onto a uniform grid"
     if shared := elapsed.size - sources.size:
@@ -387,8 +388,9 @@ def _exact_interval(
         rate = table.source.stated_rate()
         if rate and abs(1 / rate - measured) <= tolerance / steps:
             return 1 / rate
-        # Digits beyond this uncertainty come from the rounding of the times.
-        unsure = max(2 * rounding / steps, 5e-13 * measured)
+        # Digits beyond this uncertainty come from the rounding of the first and the last time, of
+        # half a unit each.
+        unsure = max(rounding / steps, 5e-13 * measured)
         rounded = []
         for digits in range(1, 13):
             rounded += [float(f"{measured:.{digits}g}")]
