@@ -195,7 +195,7 @@ def test_no_default_prior_knows_an_absolute_voltage_or_displacement() -> None:
         duration=16.0,
         rounding=0.01,
         resolution=0.005,
-        covariates={"temperature_degC": (20.0, 30.0)},
+        covariates={"temperature_degC": (20.0, 30.0), "load_N": (0.0, 5.0)},
     )
     per_input, per_output = 1e-3, 1e6
     scaled = replace(ranges, voltage=ranges.voltage * per_input, bias=ranges.bias * per_input)

@@ -195,8 +195,8 @@ class SampledModel:
         for stage in actuator.stages:
             if stage.sees:
                 raise InputError(
-                    f"stages: {stage.name} follows {stage.sees}, which a model of one sample at "
-                    "a time does not see; fit without it"
+                    f"stages: {stage.name} follows {' and '.join(stage.sees)}, which a model of "
+                    "one sample at a time does not see; fit without it"
                 )
         sections = actuator.sections(column).taps
         return cls(actuator, column, actuator.hysteresis.step(column), sections)

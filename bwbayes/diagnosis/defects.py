@@ -60,7 +60,7 @@ class Defect:
     def explanations(self, scene: ResidualAnalysis) -> Iterator[Explanation]:
         """Fit the model with the stage to a record that does not have it yet."""
         stage, inputs = STAGES[self.stage](), scene.posterior.single_record.inputs
-        if self.stage in scene.study.spec.chain or not inputs.has(stage.sees):
+        if self.stage in scene.study.spec.chain or not all(map(inputs.has, stage.sees)):
             return
         if not (stage.rate_independent or inputs.quantities.has_clock):
             return

@@ -157,7 +157,8 @@ def unexcited(findings: Iterable[Finding]) -> str:
 
 def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator[Finding]:
     """Compare the covariates that stages of the model use with their ranges in training."""
-    seen_names = {stage.sees for stage in posterior.datasets[0].actuator.stages}
+    stages = posterior.datasets[0].actuator.stages
+    seen_names = {name for stage in stages for name in stage.sees}
     for name in sorted(seen_names & {*inputs.covariates}):
         ranges = [data.inputs.range_of(name, data.training) for data in posterior.datasets]
         low, high = min(low for low, _ in ranges), max(high for _, high in ranges)

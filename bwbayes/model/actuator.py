@@ -131,12 +131,13 @@ class Actuator:
 
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:
-        """The parameters that the parts declare, in the order of θ's columns."""
+        """The parameters that the parts declare, in the order of θ's columns.
+
+        One that several stages declare is the same.
+        """
         parts = (self.hysteresis, self.nonlinearity, self.filter, self.creep, *self.stages)
-        return (
-            *(d for component in parts if component is not None for d in component.parameters),
-            OFFSET,
-        )
+        declared = [d for component in parts if component is not None for d in component.parameters]
+        return tuple({d.name: d for d in (*declared, OFFSET)}.values())
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:

@@ -161,8 +161,8 @@ class Inputs:
         return {"voltage": voltage, "covariates": covariates}
 
     def has(self, name: str) -> bool:
-        """Tell whether there is a column of that name; whatever has none sees nothing."""
-        return name in ("", "time", "voltage", *self.covariates)
+        """Tell whether there is a column of that name."""
+        return name in ("time", "voltage", *self.covariates)
 
     def column(self, name: str) -> FloatArray:
         """Return what a part of the model sees, (samples,): time, voltage or a covariate.

@@ -103,7 +103,7 @@ def inverse(
         inputs = Inputs(np.zeros(samples.size), interval=actuator.interval)
         result[row] = single.voltage(samples, inputs, limits or Limits(), nearest)
         # A stage that sees the command is undone with that of the pass before, in 40 at most.
-        follows = [stage.name for stage in actuator.stages if stage.sees == "voltage"]
+        follows = [stage.name for stage in actuator.stages if "voltage" in stage.sees]
         for _ in range(40 if follows else 0):
             inputs = replace(inputs, voltage=result[row].copy())
             result[row] = single.voltage(samples, inputs, limits or Limits(), nearest)

@@ -50,9 +50,9 @@ class Stage(ABC):
     side: ClassVar[Side]
     rate_independent: ClassVar[bool] = False
     """Whether only the path of its values counts, not their pace: then it shapes loops."""
-    sees: ClassVar[str] = ""
-    """A column of the inputs that it sees: ``"time"``, s since the record began, ``"voltage"``, the
-    command, or a covariate. Its value at a sample is then the last of the ``parameters``.
+    sees: ClassVar[tuple[str, ...]] = ()
+    """Columns of the inputs that it sees: ``"time"``, s since the record began, ``"voltage"``, the
+    command, or a covariate. Their values at a sample are then the last of the ``parameters``.
     """
     remembers: ClassVar[int] = 0
     """How many numbers it remembers from sample to sample."""
@@ -82,15 +82,15 @@ class Stage(ABC):
         return np.stack([column[declared.name] for declared in self.parameters], axis=1)
 
     def numbers_at(self, column: Values, timing: Timing, inputs: Inputs) -> FloatArray:
-        """Return the same with what the stage sees at the first of inputs, if it sees any."""
+        """Return the same with what the stage sees at the first of inputs."""
         numbers = self.numbers(column, timing)
-        if not self.sees:
-            return numbers
-        return np.column_stack([numbers, np.full(len(numbers), inputs.column(self.sees)[0])])
+        first = [np.full(len(numbers), inputs.column(name)[0]) for name in self.sees]
+        return np.column_stack([numbers, *first])
 
-    def seen(self, inputs: Inputs) -> FloatArray | None:
-        """Return what it sees of inputs, (samples,), if it sees any."""
-        return inputs.column(self.sees) if self.sees else None
+    def seen(self, inputs: Inputs) -> FloatArray:
+        """Return what it sees of inputs, (columns, samples)."""
+        columns = [inputs.column(name) for name in self.sees]
+        return np.reshape(columns, (len(columns), inputs.samples))
 
     def reach(self, column: Values) -> tuple[float, float]:  # noqa: ARG002
         """Return how far before and behind a sample it needs the inputs, s, of models (models,)."""
@@ -145,14 +145,14 @@ class Stage(ABC):
     ) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models, samples) of values, and the memory after them.
 
-        All models take one sample together. The arguments are not changed. ``seen`` (samples,) is
-        what the stage sees.
+        All models take one sample together. The arguments are not changed. ``seen`` is what
+        the stage sees, (columns, samples); by default as ``numbers`` have it.
         """
         result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
         for sample in range(values.shape[1]):
             if seen is not None:
-                rows[-1] = seen[sample]
+                rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]
             result[:, sample] = self.move(rows, now, values[:, sample], after)
             now, after = after, now
         return result, now.T.copy()
@@ -176,7 +176,7 @@ class Stage(ABC):
         now, after = memory.T.copy(), np.empty(memory.T.shape)
         for sample in range(values.shape[1]):
             if seen is not None:
-                rows[-1] = seen[sample]
+                rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]
             result[:, sample] = self.undo(rows, now, values[:, sample])
             self.move(rows, now, result[:, sample], after)
             now, after = after, now

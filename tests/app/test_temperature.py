@@ -1,6 +1,6 @@
-"""An actuator whose gain follows a temperature, which is recorded beside the voltage or not.
+"""An actuator whose gain and loop follow a temperature, recorded beside the voltage or not.
 
-The plant is simulated without the stage: the displacement of an actuator, multiplied.
+The plant is simulated without the stages: the displacement of an actuator, multiplied.
 """
 
 import warnings
@@ -27,17 +27,24 @@ from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.io.binary import record_arrays
 from tests.app import small
 
-INTERVAL, PER_KELVIN, REFERENCE = 0.02, 0.002, 22.0
+INTERVAL, PER_KELVIN, WIDER, REFERENCE = 0.02, 0.002, 0.005, 22.0
 SLOW = np.arange(700) * INTERVAL
 
 
-def plant(voltage: FloatArray, temperature: FloatArray, seed: int) -> FloatArray:
-    """Return readings (samples,) with 0.1 um of noise of a loop that 15 K make 3% larger."""
+def plant(
+    voltage: FloatArray, temperature: FloatArray, seed: int, wider: float = 0.0
+) -> FloatArray:
+    """Return readings (samples,) with 0.1 um of noise of a loop that 15 K make 3% larger.
+
+    Its width, about the straight line between its ends, grows by a further part per kelvin.
+    """
     actuator = Actuator("none", "first", INTERVAL)
     values = {"d": 0.7, "alpha": 0.3, "beta": 0.04, "gamma": 0.01, "exponent": 1.0}
     values |= {"initial": 0.0, "offset": 0.0}
     theta = np.array([[values[name] for name in actuator.parameters]])
     moved = actuator.displacement(theta, voltage, from_rest=True)[0]
+    straight = voltage * np.ptp(moved) / np.ptp(voltage)
+    moved = straight + (moved - straight) * (1 + wider * (temperature - REFERENCE))
     noise = 0.1 * np.random.default_rng(seed).standard_normal(voltage.size)
     return np.asarray(3.0 + moved * (1 + PER_KELVIN * (temperature - REFERENCE)) + noise)
 
@@ -48,7 +55,7 @@ def measured(low: float, high: float, seed: int, period: float = 1.0) -> bw.Reco
     temperature = np.linspace(low, high, voltage.size)
     return bw.Record.from_arrays(
         voltage,
-        plant(voltage, temperature, seed),
+        plant(voltage, temperature, seed, WIDER),
         interval=INTERVAL,
         covariates={"temperature_degC": temperature},
     )
@@ -59,7 +66,8 @@ TRAINED = measured(15.0, 30.0, 1)
 
 @pytest.fixture(scope="module")
 def fit() -> Any:
-    keys = {"stages": ["temperature"], "from_rest": True, "ess": 400, "progress": False}
+    stages = ["temperature", "temperature-width"]
+    keys = {"stages": stages, "from_rest": True, "ess": 400, "progress": False}
     with warnings.catch_warnings(record=True) as caught, pytest.MonkeyPatch.context() as patch:
         small.without_explanations(patch)
         warnings.simplefilter("always")
@@ -69,12 +77,15 @@ def fit() -> Any:
     return found
 
 
-def test_the_coefficient_is_inside_its_interval(fit: Any) -> None:
+@pytest.mark.parametrize(
+    ("name", "truth"), [("temperature_gain", PER_KELVIN), ("temperature_width", WIDER)]
+)
+def test_a_coefficient_is_inside_its_interval(fit: Any, name: str, truth: float) -> None:
     """One truth in a hundred is not, and one noise in a hundred shows no such coefficient."""
-    found = fit.flat_draws[:, fit.study.posterior.names.index("temperature_gain")]
+    found = fit.flat_draws[:, fit.study.posterior.names.index(name)]
     low, high = np.quantile(found, [0.005, 0.995])
-    assert low < PER_KELVIN < high
-    assert np.std(found) < 0.1 * PER_KELVIN
+    assert low < truth < high
+    assert np.std(found) < 0.1 * truth
 
 
 def covered(bands: Any, record: bw.Record) -> float:
@@ -159,7 +170,7 @@ def test_a_config_names_the_column_of_a_covariate(said: str, shift: float, tmp_p
 class Dilated(MovingGain):
     """A gain that follows another covariate, whatever the range of that."""
 
-    sees: ClassVar = "humidity_percent"
+    sees: ClassVar = ("humidity_percent",)
 
 
 @pytest.mark.parametrize("stage", ["temperature", "tests.app.test_temperature:Dilated"])

@@ -34,8 +34,8 @@ from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
+from bwbayes.model.stages.covariates import Temperature
 from bwbayes.model.stages.delay import Delay
-from bwbayes.model.stages.gain import Temperature
 from bwbayes.model.stages.saturation import Saturation
 from bwbayes.record.teststand import RING_BENDER, true_values
 from tests.control.compiled import Compiled
@@ -64,7 +64,14 @@ VALUES = {
     "sensor_middle": 2.0,
     "sensor_half": 60.0,
     "temperature_gain": 2e-3,
+    "temperature_width": 5e-3,
+    "temperature_offset": 0.1,
     "temperature_reference": 24.0,
+    "load_gain": 4e-3,
+    "load_width": -0.02,
+    "load_offset": 0.3,
+    "load_reference": 2.0,
+    "loop_slope": 0.6,
     "heating": 0.04,
     "heating_time": 0.2,
     "heating_speed": 1000.0,
@@ -108,7 +115,9 @@ def drive(samples: int = 600, seed: int = 3) -> FloatArray:
 def inputs_of(voltage: FloatArray) -> Inputs:
     time = np.arange(voltage.size) / 600
     temperature = 20 + 8 * time + 2 * np.sin(9 * time)
-    return Inputs(voltage, interval=INTERVAL, covariates={"temperature_degC": temperature})
+    load = 3 + 2 * np.cos(7 * time)
+    covariates = {"temperature_degC": temperature, "load_N": load}
+    return Inputs(voltage, interval=INTERVAL, covariates=covariates)
 
 
 def actuator(
@@ -172,6 +181,7 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
     """Return what a stage at rest at the first value makes of values (samples,)."""
     v, inputs = VALUES, inputs_of(x)
     t, warmer = inputs.time, inputs.column("temperature_degC") - v["temperature_reference"]
+    pressed, straight = inputs.column("load_N") - v["load_reference"], v["loop_slope"] * x
     s = (x - v["sensor_middle"]) / v["sensor_half"]
     middle, reach, phase = v["saturation_middle"], v["saturation_reach"], 2 * np.pi * 50.0 * t
     samples = np.arange(x.size)
@@ -182,6 +192,11 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
         "slew-limit": _with_slew_limit(x),
         "saturation": middle + reach * np.tanh((x - middle) / reach),
         "temperature": x * (1 + v["temperature_gain"] * warmer),
+        "temperature-width": straight + (x - straight) * (1 + v["temperature_width"] * warmer),
+        "temperature-offset": x + v["temperature_offset"] * warmer,
+        "load": x * (1 + v["load_gain"] * pressed),
+        "load-width": straight + (x - straight) * (1 + v["load_width"] * pressed),
+        "load-offset": x + v["load_offset"] * pressed,
         "moving-gain": x * (1 + v["gain_drift"] * t),
         "heating": x * (1 + v["heating"] * np.array(_heat(x))),
         "sensor-curve": x
@@ -355,7 +370,9 @@ def test_a_controller_s_inverse_undoes_a_stage(name: str, hold: Hold, tmp_path: 
     assert np.quantile(error, 0.98) < 1e-6
 
 
-@pytest.mark.parametrize("names", [("backlash",), ("amplifier-lag", "temperature", "backlash")])
+@pytest.mark.parametrize(
+    "names", [("backlash",), ("amplifier-lag", "temperature-width", "temperature", "backlash")]
+)
 @pytest.mark.parametrize("from_rest", [False, True])
 @pytest.mark.parametrize("creep", [None, Creep((0.1, 1.0), False, SPAN)])
 def test_both_engines_give_the_same_log_density(
@@ -386,6 +403,31 @@ def test_both_engines_give_the_same_log_density(
         densities.append(likelihood.start(every))
     for numpy, compiled in zip(*densities, strict=True):
         np.testing.assert_allclose(compiled, numpy, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in STAGES if name not in UNDONE])
+def test_a_stage_undoes_what_it_makes_of_what_it_sees(name: str) -> None:
+    stage, x = STAGES[name](), drive(120)
+    column = {one: np.array([value]) for one, value in VALUES.items()}
+    inputs = inputs_of(np.cos(x))
+    numbers, seen = stage.numbers_at(column, Timing(INTERVAL, "first"), inputs), stage.seen(inputs)
+    memory = np.empty((1, 0))
+    made, _ = stage.advance(numbers, memory, x[np.newaxis], seen)
+    assert not np.allclose(made, x)
+    np.testing.assert_allclose(stage.inverse(numbers, memory, made, seen), [x], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["temperature-width", "load-width"])
+def test_a_wider_loop_starts_from_rest_where_another_does(name: str) -> None:
+    """At zero volts, whatever the first voltage."""
+    stage, column = STAGES[name](), {one: np.array([value]) for one, value in VALUES.items()}
+    numbers = stage.numbers_at(column, Timing(INTERVAL, "first"), inputs_of(drive() + 7.0))
+    assert stage.settled(numbers, np.zeros(1))[0] == 0.0
+
+
+def test_stages_that_follow_one_covariate_share_its_reference() -> None:
+    made = actuator("temperature-width", "temperature", "temperature-offset")
+    assert made.parameters.count("temperature_reference") == 1
 
 
 def test_a_chain_stands_in_the_order_of_the_signal() -> None:
@@ -450,13 +492,13 @@ def test_a_stage_without_undo_is_refused_in_one_line_where_a_command_is_asked_fo
 class Aging(Temperature):
     """y = x (1 + c (t − t₀)): sees the time."""
 
-    name, sees = "aging", "time"
+    name, sees = "aging", ("time",)
 
 
 class Leaking(Temperature):
     """The same with the command in place of the time: cross-talk."""
 
-    name, sees = "leaking", "voltage"
+    name, sees = "leaking", ("voltage",)
 
 
 @pytest.mark.parametrize("kind", [Aging, Leaking])
@@ -466,7 +508,7 @@ def test_a_stage_sees_time_or_command(kind: type[Stage]) -> None:
     models, inputs = theta(made), inputs_of(drive())
     without = replace(made, stages=()).displacement(np.delete(models, [-3, -2], axis=1), inputs)
     change, reference, offset = np.hsplit(models[:, -3:], 3)
-    seen = inputs.column(kind.sees)
+    seen = inputs.column(*kind.sees)
     expected = offset + (without - offset) * (1 + change * (seen - reference))
     for moved in (made.displacement(models, inputs), walk(made, models, inputs)(inputs.samples)):
         np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-10)

@@ -128,7 +128,7 @@ def _resolved(config: Config, study: Study, stand: VirtualTestStand | None) -> R
     require_known("truth", config.truth, study.posterior.table, elsewhere=True)
     actuator = study.posterior.datasets[0].actuator
     remarks += [
-        f"loops and step responses leave out what {stage.name} makes of {stage.sees}"
+        f"loops and step responses leave out what {stage.name} makes of {' and '.join(stage.sees)}"
         for stage in actuator.without_events.stages
         if stage.sees and not stage.rate_independent
     ]

@@ -193,7 +193,7 @@ def _advance_stage(
     if type(stage).advance is not Stage.advance:
         return stage.advance(numbers, memory, values, seen)  # takes all samples at once
     result, after = np.empty(values.shape), memory.copy()
-    seen = np.empty(0) if seen is None else seen.copy()  # numba compiles for this type alone
+    seen = np.empty((0, 0)) if seen is None else seen.copy()  # numba compiles for this type alone
     _pass(stage, numbers.copy("C"), after, np.ascontiguousarray(values), seen, result)
     return result, after
 
@@ -209,7 +209,7 @@ def _drive_of_own(
     if isinstance(step, RelaxingStep):
         # Add the row that tells its lanes whether any model is curved or depends on a sign.
         numbers = np.column_stack([numbers, np.full(len(numbers), step.curved or step.signed)])
-    _pass(step, numbers, after, np.ascontiguousarray(voltage), np.empty(0), drive)
+    _pass(step, numbers, after, np.ascontiguousarray(voltage), np.empty((0, 0)), drive)
     return drive, after
 
 
@@ -234,8 +234,8 @@ def _pass(
             last = min(first + PIECE, samples)
             _enter(values, group, first, entering[: last - first])
             for t in range(last - first):
-                if seen.size > 0:
-                    rows[-1, :] = seen[first + t]
+                for k in range(len(seen)):
+                    rows[k - len(seen), :] = seen[k, first + t]
                 move_lanes(kind, rows, now, entering[t], after, leaving[t])
                 now[:] = after
             _leave(leaving[: last - first], group, first, result)

@@ -30,7 +30,7 @@ class Drift(Stage):
 
     name: ClassVar = "drift"
     side: ClassVar[Side] = "output"
-    sees: ClassVar = "time"
+    sees: ClassVar = ("time",)
     advice: ClassVar = "measure again after a longer warm-up"
     parameters: tuple[Declaration, ...] = (
         _size("drift", "um/s", "v_d", "drift of the readings", 0.1),
@@ -57,7 +57,7 @@ class Transient(Stage):
 
     name: ClassVar = "transient"
     side: ClassVar[Side] = "output"
-    sees: ClassVar = "time"
+    sees: ClassVar = ("time",)
     starts: ClassVar = tuple({"transient_time": z} for z in (-1.2, 0.0, 1.2))
     advice: ClassVar = "wait until everything has settled"
     parameters: tuple[Declaration, ...] = (
@@ -104,7 +104,7 @@ class OffsetStep(Stage):
 
     name: ClassVar = "step"
     side: ClassVar[Side] = "output"
-    sees: ClassVar = "time"
+    sees: ClassVar = ("time",)
     advice: ClassVar = "fit one side of the step"
     parameters: tuple[Declaration, ...] = (
         _size("step", "um", "A_1", "step of the readings", 0.1),
@@ -141,7 +141,7 @@ class Oscillation(Stage):
 
     name: ClassVar = "oscillation"
     side: ClassVar[Side] = "output"
-    sees: ClassVar = "time"
+    sees: ClassVar = ("time",)
     advice: ClassVar = "look for the source: mains, ground loops, vibration"
     parameters: tuple[Declaration, ...] = (
         _size("oscillation_sine", "um", "A_s", "oscillation in the readings, its sine", 0.01),

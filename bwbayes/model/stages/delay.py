@@ -28,7 +28,7 @@ class Delay(Stage):
 
     name: ClassVar = "delay"
     side: ClassVar[Side] = "input"
-    sees: ClassVar = "voltage"
+    sees: ClassVar = ("voltage",)
     starts: ClassVar = tuple({"delay": z} for z in (-0.1, 0.0, 0.1))
     advice: ClassVar = "move the column that is late up by rows in the file"
     parameters: tuple[Declaration, ...] = (
@@ -59,8 +59,8 @@ class Delay(Stage):
         return self.numbers(column, timing) - inputs.around[1]
 
     def seen(self, inputs: Inputs) -> FloatArray:
-        """Return the whole path (any,), V, of which the inputs are a part."""
-        return inputs.around[0]
+        """Return the whole path (1, any), V, of which the inputs are a part."""
+        return inputs.around[0][np.newaxis]
 
     def reach(self, column: Values) -> tuple[float, float]:
         """Return the longest delay of either sign, s."""
@@ -86,7 +86,7 @@ class Delay(Stage):
         """Return the path as late as each model has it, (models, samples)."""
         if seen is None:
             return values, memory
-        return _late(numbers, seen, values.shape[1]), memory
+        return _late(numbers, seen[0], values.shape[1]), memory
 
     def inverse(
         self,

@@ -1,7 +1,7 @@
 """A displacement that is larger at some times than at others, as a piezo's is when it is warm.
 
-A piezo moves by some tenths of a percent more or less for every kelvin. Where the temperature is
-recorded, a model follows it; where it is not, the gain drifts along a record, or rises as the
+A piezo moves by some tenths of a percent more or less for every kelvin. Where no temperature is
+recorded (:mod:`bwbayes.model.stages.covariates`), the gain drifts along a record, or rises as the
 actuator heats itself.
 """
 
@@ -17,56 +17,12 @@ from bwbayes.model.declaration import Declaration, Values, lognormal, normal
 from bwbayes.model.stage import Side, Stage, Timing
 
 
-class Temperature(Stage):
-    """Gain that follows the temperature: y = x (1 + c (T − T₀)), of displacement x, um.
-
-    T is the covariate ``temperature_degC`` and T₀ the middle of its range in the fitted records.
-    """
-
-    name: ClassVar = "temperature"
-    side: ClassVar[Side] = "output"
-    sees: ClassVar = "temperature_degC"
-    advice: ClassVar = "keep the temperature constant"
-
-    parameters: tuple[Declaration, ...] = (
-        Declaration(
-            "temperature_gain",
-            "1/K",
-            "c_T",
-            "relative change of the displacement with the temperature",
-            lambda _: normal(0.0, 0.01),
-        ),
-        Declaration(
-            "temperature_reference",
-            "degC",
-            "T_0",
-            "temperature at which the displacement is that of the other parameters",
-            lambda context: context.ranges.middle_of("temperature_degC"),
-        ),
-    )
-
-    def describe(self, values: Mapping[str, float]) -> str:
-        """Say how much a kelvin changes, and from where."""
-        percent, reference = 100 * values["temperature_gain"], values["temperature_reference"]
-        return f"displacement that changes by {percent:+.2g}% per K from {reference:.3g} degC on"
-
-    @staticmethod
-    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
-        """Return y."""
-        return value * (1.0 + parameters[0] * (parameters[2] - parameters[1]))
-
-    @staticmethod
-    def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
-        """Return x."""
-        return value / (1.0 + parameters[0] * (parameters[2] - parameters[1]))
-
-
 class MovingGain(Stage):
     """Gain that drifts along a record: y = x (1 + g t), of displacement x, um."""
 
     name: ClassVar = "moving-gain"
     side: ClassVar[Side] = "output"
-    sees: ClassVar = "time"
+    sees: ClassVar = ("time",)
     advice: ClassVar = "measure at a constant temperature"
 
     parameters: tuple[Declaration, ...] = (
@@ -106,7 +62,7 @@ class Heating(Stage):
 
     name: ClassVar = "heating"
     side: ClassVar[Side] = "output"
-    sees: ClassVar = "voltage"
+    sees: ClassVar = ("voltage",)
     remembers: ClassVar = 2
     starts: ClassVar = tuple({"heating_time": z} for z in (-1.0, 0.5))
     advice: ClassVar = "measure when it has warmed up, or drive more slowly"

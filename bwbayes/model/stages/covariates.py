@@ -1,0 +1,227 @@
+"""A displacement that follows a covariate, a further column of the record, by a straight line.
+
+A piezo moves by some tenths of a percent more or less for every kelvin, its loop is wider or
+narrower, and its mount expands; a load does the same. Each is a stage with one coefficient, which
+evidence may choose alone: of the gain, of the loop's width, and of the offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges, normal
+from bwbayes.model.stage import Side, Stage
+
+
+class Covariate(NamedTuple):
+    """A covariate that stages follow.
+
+    ``column`` is its name in a record, ``name`` what it is, ``unit`` that of a value, ``per`` that
+    of a difference. ``relative`` is the prior sd of the change that a unit makes, in parts; a
+    column that says nothing has zero.
+    """
+
+    column: str
+    name: str
+    unit: str
+    per: str
+    symbol: str
+    relative: Callable[[Ranges], float]
+
+    def coefficient(self, effect: str, symbol: str, unit: str, description: str) -> Declaration:
+        """Declare the change of something, in parts or um, with it."""
+
+        def default(context: Context) -> Distribution | float:
+            size = context.ranges.displacement if unit == "um" else 1.0
+            sd = size * self.relative(context.ranges)
+            return normal(0.0, sd) if sd else 0.0
+
+        return Declaration(
+            f"{self.name}_{effect}",
+            f"{unit}/{self.per}",
+            f"{symbol}_{self.symbol}",
+            f"{description} with the {self.name}",
+            default,
+        )
+
+    @property
+    def reference(self) -> Declaration:
+        """Declare the value from which it counts, which all stages that follow it share."""
+        return Declaration(
+            f"{self.name}_reference",
+            self.unit,
+            f"{self.symbol}_0",
+            f"{self.name} at which the displacement is that of the other parameters",
+            lambda context: context.ranges.middle_of(self.column),
+        )
+
+
+def _load_per_newton(ranges: Ranges) -> float:
+    """Let half of the load's range change a tenth."""
+    low, high = ranges.covariates["load_N"]
+    return 0.2 / (high - low) if high > low else 0.0
+
+
+TEMPERATURE = Covariate("temperature_degC", "temperature", "degC", "K", "T", lambda _: 0.01)
+LOAD = Covariate("load_N", "load", "N", "N", "F", _load_per_newton)
+
+
+class _Follows(Stage):
+    """Stage that follows a covariate."""
+
+    side: ClassVar[Side] = "output"
+    advice: ClassVar = "keep temperature and load constant"
+    of: ClassVar[Covariate]
+    changes: ClassVar[str]
+
+    def describe(self, values: Mapping[str, float]) -> str:
+        """Say how much a unit changes, and from where."""
+        coefficient = self.parameters[0]
+        change, reference = values[coefficient.name], values[self.of.reference.name]
+        size = f"{100 * change:+.2g}%" if coefficient.unit[0] == "1" else f"{change:+.2g} um"
+        start = f"{reference:.3g} {self.of.unit}"
+        return f"{self.changes} by {size} per {self.of.per} from {start} on"
+
+
+class _Gain(_Follows):
+    changes: ClassVar = "displacement that changes"
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return y."""
+        return value * (1.0 + parameters[0] * (parameters[2] - parameters[1]))
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
+        """Return x."""
+        return value / (1.0 + parameters[0] * (parameters[2] - parameters[1]))
+
+
+class _Width(_Follows):
+    changes: ClassVar = "loop whose width changes"
+
+    def settled(self, numbers: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return y at rest, which is at zero volts, and no memory."""
+        at_zero = numbers.copy()
+        at_zero[:, -2] = 0.0
+        return super().settled(at_zero, value)
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return y."""
+        straight = parameters[2] * parameters[3]
+        wider = 1.0 + parameters[0] * (parameters[4] - parameters[1])
+        return straight + (value - straight) * wider
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
+        """Return x."""
+        straight = parameters[2] * parameters[3]
+        wider = 1.0 + parameters[0] * (parameters[4] - parameters[1])
+        return straight + (value - straight) / wider
+
+
+class _Offset(_Follows):
+    changes: ClassVar = "offset that changes"
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return y."""
+        return value + parameters[0] * (parameters[2] - parameters[1])
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
+        """Return x."""
+        return value - parameters[0] * (parameters[2] - parameters[1])
+
+
+SLOPE = Declaration(
+    "loop_slope",
+    "um/V",
+    "s_l",
+    "slope of the straight line from which a loop's width counts, from end to end",
+    lambda context: context.ranges.slope,
+)
+
+
+def _gain(of: Covariate) -> tuple[Declaration, ...]:
+    description = "relative change of the displacement"
+    return of.coefficient("gain", "c", "1", description), of.reference
+
+
+def _width(of: Covariate) -> tuple[Declaration, ...]:
+    description = "relative change of the loop's width, beside the displacement's,"
+    return of.coefficient("width", "w", "1", description), of.reference, SLOPE
+
+
+def _offset(of: Covariate) -> tuple[Declaration, ...]:
+    return of.coefficient("offset", "o", "um", "change of the offset"), of.reference
+
+
+class Temperature(_Gain):
+    """Gain that follows the temperature: y = x (1 + c (T − T₀)), of displacement x, um.
+
+    T is the covariate ``temperature_degC`` and T₀ the middle of its range in the fitted records.
+    """
+
+    name: ClassVar = "temperature"
+    of: ClassVar = TEMPERATURE
+    sees: ClassVar = (TEMPERATURE.column,)
+    parameters: tuple[Declaration, ...] = _gain(TEMPERATURE)
+
+
+class TemperatureWidth(_Width):
+    """Loop width that follows the temperature: y = s u + (x − s u) (1 + w (T − T₀)), um.
+
+    With u the voltage and s the slope from end to end of the fitted loop: its ends stay, and what
+    is between them widens, with all that departs from the straight line.
+    """
+
+    name: ClassVar = "temperature-width"
+    of: ClassVar = TEMPERATURE
+    sees: ClassVar = ("voltage", TEMPERATURE.column)
+    parameters: tuple[Declaration, ...] = _width(TEMPERATURE)
+
+
+class TemperatureOffset(_Offset):
+    """Offset that follows the temperature, as a mount expands: y = x + o (T − T₀), um."""
+
+    name: ClassVar = "temperature-offset"
+    of: ClassVar = TEMPERATURE
+    sees: ClassVar = (TEMPERATURE.column,)
+    parameters: tuple[Declaration, ...] = _offset(TEMPERATURE)
+
+
+class Load(_Gain):
+    """Gain that follows the load: y = x (1 + c (F − F₀)), of displacement x, um.
+
+    F is the covariate ``load_N`` and F₀ the middle of its range in the fitted records.
+    """
+
+    name: ClassVar = "load"
+    of: ClassVar = LOAD
+    sees: ClassVar = (LOAD.column,)
+    parameters: tuple[Declaration, ...] = _gain(LOAD)
+
+
+class LoadWidth(_Width):
+    """Loop width that follows the load: y = s u + (x − s u) (1 + w (F − F₀)), um.
+
+    With u and s as of ``temperature-width``.
+    """
+
+    name: ClassVar = "load-width"
+    of: ClassVar = LOAD
+    sees: ClassVar = ("voltage", LOAD.column)
+    parameters: tuple[Declaration, ...] = _width(LOAD)
+
+
+class LoadOffset(_Offset):
+    """Offset that follows the load, as a spring gives way: y = x + o (F − F₀), um."""
+
+    name: ClassVar = "load-offset"
+    of: ClassVar = LOAD
+    sees: ClassVar = (LOAD.column,)
+    parameters: tuple[Declaration, ...] = _offset(LOAD)
