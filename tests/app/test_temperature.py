@@ -36,14 +36,14 @@ def plant(
 ) -> FloatArray:
     """Return readings (samples,) with 0.1 um of noise of a loop that 15 K make 3% larger.
 
-    Its width, about the straight line between its ends, grows by a further part per kelvin.
+    Its hysteresis grows by a further part per kelvin.
     """
     actuator = Actuator("none", "first", INTERVAL)
     values = {"d": 0.7, "alpha": 0.3, "beta": 0.04, "gamma": 0.01, "exponent": 1.0}
     values |= {"initial": 0.0, "offset": 0.0}
     theta = np.array([[values[name] for name in actuator.parameters]])
     moved = actuator.displacement(theta, voltage, from_rest=True)[0]
-    straight = voltage * np.ptp(moved) / np.ptp(voltage)
+    straight = values["d"] * voltage
     moved = straight + (moved - straight) * (1 + wider * (temperature - REFERENCE))
     noise = 0.1 * np.random.default_rng(seed).standard_normal(voltage.size)
     return np.asarray(3.0 + moved * (1 + PER_KELVIN * (temperature - REFERENCE)) + noise)
@@ -98,7 +98,7 @@ def test_a_next_record_at_another_temperature_is_covered(fit: Any) -> None:
     other = measured(29.0, 29.5, 2, 1.3)
     wrong = replace(other, covariates={"temperature_degC": np.full(other.samples, 17.0)})
     assert covered(fit.predict(other, from_rest=True), other) > 0.9
-    with pytest.warns(bw.InputWarning, match="another gain"):
+    with pytest.warns(bw.InputWarning, match="loop-shaped residuals"):
         assert covered(fit.predict(wrong, from_rest=True), wrong) < 0.5
 
 

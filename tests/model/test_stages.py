@@ -71,7 +71,7 @@ VALUES = {
     "load_width": -0.02,
     "load_offset": 0.3,
     "load_reference": 2.0,
-    "loop_slope": 0.6,
+    "d": 1.0,
     "heating": 0.04,
     "heating_time": 0.2,
     "heating_speed": 1000.0,
@@ -133,7 +133,7 @@ def theta(made: Actuator, models: int = 3) -> FloatArray:
     values = true_values(made, {**table, "initial": 0.1}) | {"lag": 3e-3}
     values |= {name: value for name, value in VALUES.items() if name in values}
     rows = np.tile([*values.values()], (models, 1))
-    free = [i for i, name in enumerate(made.parameters) if name in VALUES or name == "d"]
+    free = [i for i, name in enumerate(made.parameters) if name in VALUES]
     scale = 1 + 0.2 * np.random.default_rng(1).uniform(-1, 1, (models - 1, len(free)))
     rows[1:, free] *= scale
     return rows
@@ -181,7 +181,7 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
     """Return what a stage at rest at the first value makes of values (samples,)."""
     v, inputs = VALUES, inputs_of(x)
     t, warmer = inputs.time, inputs.column("temperature_degC") - v["temperature_reference"]
-    pressed, straight = inputs.column("load_N") - v["load_reference"], v["loop_slope"] * x
+    pressed, straight = inputs.column("load_N") - v["load_reference"], v["d"] * x
     s = (x - v["sensor_middle"]) / v["sensor_half"]
     middle, reach, phase = v["saturation_middle"], v["saturation_reach"], 2 * np.pi * 50.0 * t
     samples = np.arange(x.size)

@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges, normal
-from bwbayes.model.stage import Side, Stage
+from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges, Values, normal
+from bwbayes.model.stage import Side, Stage, Timing
 
 
 class Covariate(NamedTuple):
@@ -102,6 +104,11 @@ class _Gain(_Follows):
 class _Width(_Follows):
     changes: ClassVar = "loop whose width changes"
 
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:
+        """Return coefficient, reference and d, (models, 3)."""
+        numbers = super().numbers(column, timing)
+        return np.column_stack([numbers, column.get("d", np.zeros(len(numbers)))])
+
     def settled(self, numbers: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return y at rest, which is at zero volts, and no memory."""
         at_zero = numbers.copy()
@@ -137,15 +144,6 @@ class _Offset(_Follows):
         return value - parameters[0] * (parameters[2] - parameters[1])
 
 
-SLOPE = Declaration(
-    "loop_slope",
-    "um/V",
-    "s_l",
-    "slope of the straight line from which a loop's width counts, from end to end",
-    lambda context: context.ranges.slope,
-)
-
-
 def _gain(of: Covariate) -> tuple[Declaration, ...]:
     description = "relative change of the displacement"
     return of.coefficient("gain", "c", "1", description), of.reference
@@ -153,7 +151,7 @@ def _gain(of: Covariate) -> tuple[Declaration, ...]:
 
 def _width(of: Covariate) -> tuple[Declaration, ...]:
     description = "relative change of the loop's width, beside the displacement's,"
-    return of.coefficient("width", "w", "1", description), of.reference, SLOPE
+    return of.coefficient("width", "w", "1", description), of.reference
 
 
 def _offset(of: Covariate) -> tuple[Declaration, ...]:
@@ -173,10 +171,10 @@ class Temperature(_Gain):
 
 
 class TemperatureWidth(_Width):
-    """Loop width that follows the temperature: y = s u + (x − s u) (1 + w (T − T₀)), um.
+    """Loop width that follows the temperature: y = d u + (x − d u) (1 + w (T − T₀)), um.
 
-    With u the voltage and s the slope from end to end of the fitted loop: its ends stay, and what
-    is between them widens, with all that departs from the straight line.
+    With u the voltage and d the operator's slope without hysteresis: all that departs from there
+    changes, dynamics and creep included. The loop of an operator without d is all of x.
     """
 
     name: ClassVar = "temperature-width"
@@ -207,9 +205,9 @@ class Load(_Gain):
 
 
 class LoadWidth(_Width):
-    """Loop width that follows the load: y = s u + (x − s u) (1 + w (F − F₀)), um.
+    """Loop width that follows the load: y = d u + (x − d u) (1 + w (F − F₀)), um.
 
-    With u and s as of ``temperature-width``.
+    With u and d as of ``temperature-width``.
     """
 
     name: ClassVar = "load-width"
