@@ -49,10 +49,14 @@ def plant(
     return np.asarray(3.0 + moved * (1 + PER_KELVIN * (temperature - REFERENCE)) + noise)
 
 
-def measured(low: float, high: float, seed: int, period: float = 1.0) -> bw.Record:
-    """Return a record along which the temperature goes from low to high, degC."""
+def measured(
+    low: float, high: float, seed: int, period: float = 1.0, back: bool = False
+) -> bw.Record:
+    """Return a record along which the temperature goes from low to high, degC, and ``back``."""
     voltage = 80 * np.exp(-0.05 * SLOW) * np.sin(2 * np.pi * SLOW / period)
     temperature = np.linspace(low, high, voltage.size)
+    if back:
+        temperature = np.concatenate([temperature[::2], temperature[::-2]])
     return bw.Record.from_arrays(
         voltage,
         plant(voltage, temperature, seed, WIDER),
@@ -100,6 +104,14 @@ def test_a_next_record_at_another_temperature_is_covered(fit: Any) -> None:
     assert covered(fit.predict(other, from_rest=True), other) > 0.9
     with pytest.warns(bw.InputWarning, match="loop-shaped residuals"):
         assert covered(fit.predict(wrong, from_rest=True), wrong) < 0.5
+
+
+def test_a_search_finds_both_coefficients() -> None:
+    """Where the temperature comes back: one that only rises is a drift of the gain as well."""
+    record = measured(15.0, 30.0, 5, back=True)
+    config, records = config_of(record, {"dynamics": "none", "from_rest": True})
+    chosen = search_stages(resolve_config(config, Path(), records))
+    assert chosen.run.config.model.stages == ["temperature-width", "temperature"]
 
 
 def test_a_temperature_beyond_those_of_training_is_said(fit: Any) -> None:
