@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import h5py
@@ -249,6 +250,30 @@ def test_a_command_is_taken_for_the_voltage_unless_an_output_may_be_there(
     values["monitor (V)"] = VOLTAGE
     with pytest.raises(ColumnsError, match="which column is the voltage"):
         read_record(write(tmp_path / "a.csv", values))
+
+
+@pytest.mark.filterwarnings("ignore:.* above the header skipped")
+@given(
+    st.sampled_from([("s", 1.0), ("ms", 1e3), ("us", 1e6)]),
+    st.sampled_from([1.0, 60.0, 3600.0]),
+    st.floats(-10, 1000),
+)
+def test_times_at_a_stated_interval_need_no_unit(
+    unit: tuple[str, float], other: float, start: float
+) -> None:
+    """An interval that none of the usual units has tells nothing."""
+    times = (round(start, 3) + 0.005 * np.arange(VOLTAGE.size)) * unit[1]
+    rows = np.column_stack([times, VOLTAGE, DISPLACEMENT]).tolist()
+    lines = [",".join(map(repr, row)) for row in rows]
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "a.csv")
+        head = [f"Sample Interval,{0.005 * other}", "", "TIME,voltage (V),displacement (um)"]
+        path.write_text("\n".join(head + lines) + "\n", encoding="utf-8")
+        if other == 1:
+            assert read_record(path).interval == pytest.approx(0.005, rel=1e-9)
+        else:
+            with pytest.raises(ColumnsError, match="which unit has 'TIME'"):
+                read_record(path)
 
 
 @given(

@@ -41,6 +41,7 @@ from bwbayes.record.io.recognition import (
     rises,
     scale_of,
     series_named,
+    unit_at_rate,
     unit_of,
     with_own_times,
 )
@@ -248,7 +249,9 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     missing = [q for q in needed if q not in chosen and not (q == "time" and has_rate)]
     units = {q: naming.units.get(q) or unit_of(s.label, s.unit, q) for q, s in chosen.items()}
     if "time" in units:
-        units["time"] = units["time"] or epoch_unit(chosen["time"].label, finite(chosen["time"]))
+        label, times = chosen["time"].label, finite(chosen["time"])
+        units["time"] = units["time"] or epoch_unit(label, times)
+        units["time"] = units["time"] or unit_at_rate(times, source.stated_rate())
     for series in (chosen[q] for q in chosen if "V" in naming.units.get(q, "") and q != "voltage"):
         if (stated := unit_of(series.label, series.unit, "voltage")) not in (None, "V"):
             advice = f"say how many um is 1 {stated}, as '0.35 um'"

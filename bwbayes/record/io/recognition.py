@@ -167,6 +167,16 @@ def epoch_unit(name: str, times: FloatArray) -> str | None:
     return next(dates, None)
 
 
+def unit_at_rate(times: FloatArray, rate: float) -> str | None:
+    """Return the unit in which times, (samples,), are sampled at a rate, Hz, or None.
+
+    The rate is one that a file states, or 0. Rounded times may be off by 1%.
+    """
+    counts = float(np.ptp(times)) * rate / (times.size - 1) if times.size > 1 else 0.0
+    powers = {u: power_of(u, "time") or 0 for u in COMMON_UNITS["time"]}
+    return next((u for u, p in powers.items() if abs(counts * 10.0**p - 1) < 0.01), None)
+
+
 def rates_by_unit(samples: int, extent: float) -> str:
     """State the sampling rate and the duration in each unit; a wrong one shows nowhere else.
 
