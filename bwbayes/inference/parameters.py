@@ -7,7 +7,7 @@ prior and gives its log density, up to the one constant that the cut leaves. It 
 to coordinates without bounds and back: the normal scores of each prior between the bounds that hold
 there. In them every prior is nearly a standard normal, whatever its scale and bounds, and so a
 posterior has Gaussian tails even where it leans on a bound (γ near β, a discrepancy near zero).
-Where a record determines but the sum of parameters, as that of a delay and a lag, the sum takes the
+Where a record determines only the sum of parameters, as of a delay and a lag, the sum takes the
 place of one of them: lags are logarithms there, and the posterior would be thin and curved.
 """
 

@@ -207,7 +207,7 @@ class Load(_Gain):
 class LoadWidth(_Width):
     """Loop width that follows the load: y = d u + (x − d u) (1 + w (F − F₀)), um.
 
-    With u and d as of ``temperature-width``.
+    u and d are those of ``temperature-width``.
     """
 
     name: ClassVar = "load-width"
