@@ -12,7 +12,7 @@ import bwbayes as bw
 from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.inference.study import generator
-from bwbayes.model.inputs import Span
+from bwbayes.model.inputs import Limits
 from bwbayes.record.teststand import PROCESS_SD, PROCESS_TIME
 from tests.control import cases
 from tests.measured import keep
@@ -52,7 +52,7 @@ def on_the_stand(fit: bw.Run) -> Tracking:
         stand.actuator,
         np.tile(truth, (DRAWS, 1)),
         cases.noise_of(DRAWS, known["sensor_sd"], PROCESS_SD, PROCESS_TIME),
-        Stand(Span(*LIMITS)),
+        Stand(Limits(*LIMITS)),
         np.random.default_rng(1),
         frequencies=FREQUENCIES,
         all_theta=one.table.actuator(every),

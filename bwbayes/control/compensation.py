@@ -57,7 +57,7 @@ from bwbayes.report.report import (
     remarks_banner,
     standing_banner,
 )
-from bwbayes.shown import brief
+from bwbayes.shown import brief, rounded
 from bwbayes.watching import Watch, part, unwatched
 
 
@@ -506,11 +506,13 @@ class Compensation(Product):
             validation += f", limit {'NOT KEPT' if self.limit_kept is False else 'uncertain'}"
             kind = "bad" if self.limit_kept is False else "note"
         promise = Banner(kind, f"Predicted error{validation}", [self._promise()])
+        fastest = f"the command changes by up to {rounded(self.fastest, 4)} V/s"
         return Report(
             title=f"{name}, compensation",
             heading=f"Compensation: {name}",
             banners=[*standing_banner(self.standing), promise, *remarks_banner(self.remarks)],
             blocks=[
+                Facts([("Amplifier", f"{self.limits}; {fastest}")]),
                 self._table(),
                 Picture(
                     "tracking",
@@ -599,7 +601,6 @@ class Compensation(Product):
         pairs = {
             "Reference": f"{extent}, {target.size} samples every {interval:g} s",
             "Command": commands[self.command],
-            "Amplifier": f"{self.limits}; the command changes by up to {self.fastest:.4g} V/s",
             "Voltage between samples": holds[self.hold],
             "Displacement between samples": f"{between} samples, just before the voltage changes",
             "Start": f"{start} at zero volts{'' if self.from_rest else ', after any drive'}",

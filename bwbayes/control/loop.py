@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.inference.state_space import Noise, root
-from bwbayes.model.inputs import Span
+from bwbayes.model.inputs import Limits, Span
 from bwbayes.record.teststand import Amplifier, LaserSensor
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched, watched
@@ -51,14 +51,19 @@ CONTROLLERS = {
 class Stand:
     """The hardware between a controller and its actuator.
 
-    The ``amplifier`` gives voltages within ``limits``, V; ``delay`` are the whole samples from a
-    reading to the command that answers it.
+    The ``limits`` are those of commands, and ``allowed`` what the ``amplifier`` leaves of them;
+    ``delay`` are the whole samples from a reading to the command that answers it.
     """
 
-    limits: Span
+    limits: Limits
     delay: int = 1
     amplifier: Amplifier = field(default_factory=Amplifier)
     sensor: LaserSensor = field(default_factory=LaserSensor)
+
+    @property
+    def allowed(self) -> Limits:
+        """The limits, with a slew that the amplifier is capable of."""
+        return replace(self.limits, slew=min(self.limits.slew, self.amplifier.slew))
 
 
 class LoopNoise(NamedTuple):
@@ -134,7 +139,7 @@ def plan_loops(
         np.pad(desired, ((0, 0), (0, longest - desired.shape[1])), mode="edge")
         for desired, _ in references
     ]
-    limits, together = stand.limits, np.vstack(padded)
+    limits, together = stand.limits.span, np.vstack(padded)
     # Voltages for the displacements (models, samples), and where the models go with them.
     voltages, displacements = np.zeros_like(together), np.zeros_like(together)
     state, last = model.begin(np.zeros(model.models)), np.zeros(model.models)
@@ -183,8 +188,8 @@ def follow(
     shape = controllers, signals, len(noise.parameters)
     # The last sample of the reference is there for those that look one ahead.
     samples -= 1
-    low, high = stand.limits
-    step, reach = stand.amplifier.step, stand.amplifier.slew * gains.interval
+    low, high = stand.limits.span
+    step, reach = stand.amplifier.step, stand.allowed.rate * gains.interval
     looks = np.array(plan.looks)[:, np.newaxis, np.newaxis]
 
     state = draws.begin(np.zeros(draws.models))
@@ -214,7 +219,7 @@ def follow(
         level = np.clip(step * np.round(command / step), low, high)
         held = np.clip(level, held - reach, held + reach)
         if t >= plan.begins:
-            limited += (command <= low) | (command >= high)
+            limited += (command <= low) | (command >= high) | (held != level)
         state = draws.forward(state, held.ravel())[1]
     judged = samples - plan.begins
     return TrackingErrors(np.sqrt(squares / judged), largest, limited / judged)

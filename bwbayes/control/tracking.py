@@ -149,7 +149,7 @@ class Tracking(Product):
                 "middle_um": self.middle,
                 "amplitude_um": self.amplitude,
                 "rise_s": self.rise,
-                "limits_V": list(self.stand.limits),
+                **self.stand.allowed.numbers,
             },
             "draws": int(self.rms.shape[-1]),
             "best_share": [
@@ -169,7 +169,7 @@ class Tracking(Product):
             f"{requested.gain:g}), phase margin at least {margins.phase.min():.0f}° (required: "
             f"{requested.phase:g}°), crossover at {margins.crossover.min():.3g} to "
             f"{margins.crossover.max():.3g} Hz; by the circle criterion stable however the slope "
-            "of the hysteresis changes"
+            "of the hysteresis changes, while the amplifier is at none of its limits"
         )
         picture = Picture(
             "track",
@@ -189,6 +189,7 @@ class Tracking(Product):
                 self._comparison(),
             ],
             blocks=[
+                Facts([("amplifier", str(self.stand.allowed))]),
                 picture,
                 Section("Errors", [self._errors()], folded=False),
                 Section("The controller", [self._gains()], folded=False),
@@ -256,10 +257,9 @@ class Tracking(Product):
             [
                 ("references", f"{self.amplitude:.4g} µm about {self.middle:.3g} µm"),
                 ("jumps", f"take {1e3 * self.rise:.3g} ms"),
-                ("limits", f"{stand.limits.low:.4g} to {stand.limits.high:.4g} V"),
                 ("sampling", f"every {1e3 * self.gains.interval:.3g} ms"),
                 ("delay", f"samples from a reading to the command that answers it: {stand.delay}"),
-                ("DAC", f"steps of {stand.amplifier.step:.3g} V, {stand.amplifier.slew:.3g} V/s"),
+                ("DAC", f"steps of {stand.amplifier.step:.3g} V"),
                 ("ADC", f"steps of {stand.sensor.step:.3g} µm"),
                 ("0 µm", "where the demagnetized actuator stands at zero volts"),
                 *self.instruments.facts.items(),
@@ -301,7 +301,7 @@ def track(
     Raises InputError: a model that has no step or no inverse, margins that cannot be had,
     frequencies that are too fast or too slow, or an amplitude that is out of reach.
     """
-    robustness, limits = robustness or Robustness(), stand.limits
+    robustness, limits = robustness or Robustness(), stand.limits.span
     all_theta = theta if all_theta is None else all_theta
     mean_theta = all_theta.mean(axis=0)
     mean = SampledModel.of(actuator, mean_theta[np.newaxis])

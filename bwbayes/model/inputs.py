@@ -24,7 +24,7 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.quantities import DEFAULT, Quantities
-from bwbayes.shown import brief
+from bwbayes.shown import brief, rounded
 
 Hold = Literal["first", "zero"]
 
@@ -374,7 +374,7 @@ class Limits:
         }
 
     def __str__(self) -> str:
-        speed = f"up to {self.rate:.4g} V/s" if math.isfinite(self.rate) else "at any speed"
+        speed = f"up to {rounded(self.rate, 4)} V/s" if math.isfinite(self.rate) else "at any speed"
         current = ""
         if self.current is not None:
             current = f", {self.current:.4g} A into {self.capacitance:.4g} F"

@@ -17,6 +17,7 @@ from bwbayes.control.exported import FILES
 from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.references import build_reference
 from bwbayes.errors import InputError
+from bwbayes.report.outputs import render
 from tests.app.conftest import Type
 
 SINE = {"reference": "sine", "amplitude": 1.0, "frequency": 1.0}
@@ -160,10 +161,14 @@ def test_voltages_beyond_those_fitted_have_to_be_allowed(verb: str, fit: bw.Run)
     job = partial(getattr(fit, verb), *shape, **options)
     with pytest.raises(InputError, match=r"-150 to 150 V goes beyond .*--beyond-training"):
         job(voltage=(-150.0, 150.0))
-    made = job(voltage=(-150.0, 150.0), beyond_training=True)
+    amplifier = {"slew": 1e4, "current": 2e-3, "capacitance": 1e-6}
+    made = job(voltage=(-150.0, 150.0), beyond_training=True, **amplifier)
     numbers = made.summary if verb == "compensate" else made.numbers()
     limits = numbers["reference"] if verb == "track" else numbers
     assert limits["limits_V"] == [-150.0, 150.0]
+    assert (1e4, 2e-3) == (limits["slew_V_per_s"], limits["current_A"])
+    said = "-150 to 150 V, up to 2000 V/s, 0.002 A into 1e-06 F"
+    assert said in render(made.report(), {})
 
 
 def test_numbers_table_and_picture_agree(

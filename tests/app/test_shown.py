@@ -14,6 +14,7 @@ from bwbayes.app.jobs.campaign import Row
 from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track
+from bwbayes.model.inputs import Limits
 from bwbayes.population.population import population
 from bwbayes.shown import LONGEST, MOST_LINES, brief, rounded
 from tests.control import cases
@@ -55,7 +56,7 @@ def followed(generator: np.random.Generator) -> Tracking:
     """Return what ``fit.track`` does, of three draws: the margins of a thousand take a minute."""
     actuator = cases.actuator("bouc-wen, second-order", "zero")
     noise = cases.noise_of(3, 0.5, 1.5, 0.5)
-    theta, stand = cases.theta(actuator, 3), Stand(cases.SPAN)
+    theta, stand = cases.theta(actuator, 3), Stand(Limits(*cases.SPAN))
     return track(actuator, theta, noise, stand, generator, frequencies=(5.0,))
 
 

@@ -27,9 +27,8 @@ from bwbayes.errors import InputError
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise, WhiteNoise
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inputs import Span
+from bwbayes.model.inputs import Limits, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.record.teststand import Amplifier
 from tests.control import cases
 from tests.control.cases import noise_of
 
@@ -74,7 +73,7 @@ def slowly(
             command = plan.ahead[c, s, t] + answers.pop(0)
             level = stand.amplifier.step * np.round(command / stand.amplifier.step)
             level = min(max(level, stand.limits.low), stand.limits.high)
-            reach, last = stand.amplifier.slew * 1e-3, held[-1] if held else 0.0
+            reach, last = stand.allowed.rate * 1e-3, held[-1] if held else 0.0
             held.append(min(max(level, last - reach), last + reach))
         judged = np.array(missed[plan.begins :])
         rms[c, s, m] = np.sqrt(np.mean(judged**2))
@@ -89,7 +88,7 @@ def test_the_loop_is_the_slow_one(name: str, delay: int) -> None:
     required = references()
     ahead = np.stack([required / 0.6, np.zeros_like(required), required / 0.6])
     # So near that it is met: then the answers are kept to what is still to be had.
-    stand = Stand(Span(-55.0, 45.0), delay, Amplifier(current=0.02))
+    stand = Stand(Limits(-55.0, 45.0, current=0.02, capacitance=1e-6), delay)
     plan = LoopPlan(
         np.clip(ahead, -55, 45),
         np.stack([0 * required, required, required]),
@@ -110,7 +109,7 @@ def test_without_feedback_it_is_the_virtual_stands_amplifier_and_actuator() -> N
     required = references(400)
     command = np.clip(required / 0.5, -80, 80)
     command[:, 0] = 0.0
-    stand = Stand(Span(-100.0, 100.0))
+    stand = Stand(Limits(-100.0, 100.0))
     plan = LoopPlan(command[np.newaxis], required[np.newaxis], (False,), required, 0)
     gains = Gains((1.0, 0.0, 0.0), 1e-3)
     got = follow(plan, gains, rows, QUIET, stand, np.random.default_rng(1))
@@ -132,7 +131,7 @@ def test_a_discrepancy_is_an_error_and_sensor_noise_is_none() -> None:
     required = np.zeros((1, 1001))
     plan = LoopPlan(np.zeros((1, 1, 1001)), np.zeros((1, 1, 1001)), (False,), required, 0)
     noise = noise_of(400, 0.5, 1.5, 0.01)
-    gains, stand = Gains((0.1, 0.0, 0.0), 1e-3), Stand(cases.SPAN)
+    gains, stand = Gains((0.1, 0.0, 0.0), 1e-3), Stand(Limits(*cases.SPAN))
     got = follow(plan, gains, rows, noise, stand, np.random.default_rng(8))
     spread = 1.5**2 * np.sqrt(2 / 40_000)
     assert np.mean(got.rms**2) == pytest.approx(1.5**2, abs=5 * spread)
@@ -172,7 +171,7 @@ def test_out_of_reach_for_long_it_comes_back_at_once() -> None:
 
     def error(begins: int) -> float:
         plan = LoopPlan(np.zeros((1, 1, 1201)), required[np.newaxis], (True,), required, begins)
-        stand, generator = Stand(limits), np.random.default_rng(1)
+        stand, generator = Stand(Limits(*limits)), np.random.default_rng(1)
         return float(follow(plan, gains, rows, QUIET, stand, generator).largest.max())
 
     assert 100 < error(900)

@@ -9,7 +9,7 @@ from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inputs import Span
+from bwbayes.model.inputs import Limits
 from tests.control import cases
 
 # As the ring bender's posterior has them; d and α go together, so that the loop keeps its size.
@@ -32,7 +32,7 @@ def draws(count: int) -> tuple[Actuator, FloatArray, LoopNoise]:
 @pytest.fixture(scope="module")
 def tracking() -> Tracking:
     rng = np.random.default_rng(2)
-    return track(*draws(40), Stand(cases.SPAN), rng, frequencies=(2.0, 10.0, 20.0))
+    return track(*draws(40), Stand(Limits(*cases.SPAN)), rng, frequencies=(2.0, 10.0, 20.0))
 
 
 def test_feed_forward_and_feedback_together_beat_either_alone(tracking: Tracking) -> None:
@@ -63,7 +63,9 @@ def test_by_default_it_goes_to_where_the_dynamics_matter() -> None:
     # Short, because a lag of the same cut-off is sampled ten times as slowly.
     slow = cases.actuator(NAME, "zero", 1e-2)
     theta[:, actuator.parameters.index("damping")] *= 10
-    made = track(slow, theta, noise, Stand(cases.SPAN), np.random.default_rng(2), amplitude=1e-3)
+    made = track(
+        slow, theta, noise, Stand(Limits(*cases.SPAN)), np.random.default_rng(2), amplitude=1e-3
+    )
     assert (0.1, 0.2, 0.5, 1.0, 2.0, 5.0) == made.frequencies
     assert 4 * 0.0385 == pytest.approx(made.rise, rel=0.1)
 
@@ -72,7 +74,7 @@ def test_a_range_on_one_side_of_zero_is_approached_first() -> None:
     actuator, theta, noise = draws(4)
     noise = cases.noise_of(4, 0.0, 0.0, 0.5)
     same = np.tile(theta.mean(axis=0), (4, 1))
-    stand = Stand(Span(0.0, 100.0))
+    stand = Stand(Limits(0.0, 100.0))
     made = track(actuator, same, noise, stand, np.random.default_rng(2), frequencies=(5.0,))
     assert made.middle - made.amplitude > 0
     # The right model, but for the DAC's steps of 0.1 V: 0.02 um rms, at the most 0.07 um.
@@ -98,4 +100,4 @@ def test_references_swing_by_their_amplitude_and_jump_in_time(frequency: float) 
 
 def test_a_tracking_of_no_frequency_is_refused() -> None:
     with pytest.raises(InputError, match="frequencies: none is given"):
-        track(*draws(3), Stand(cases.SPAN), np.random.default_rng(2), frequencies=())
+        track(*draws(3), Stand(Limits(*cases.SPAN)), np.random.default_rng(2), frequencies=())

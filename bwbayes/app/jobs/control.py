@@ -350,6 +350,9 @@ def track(
     frequencies: tuple[float, ...] | None = None,
     amplitude: float | None = None,
     voltage: tuple[float, float] | None = None,
+    slew: float | None = None,
+    current: float | None = None,
+    capacitance: float | None = None,
     beyond_training: bool = False,
     rate: float = 1000.0,
     delay: int = 1,
@@ -376,6 +379,12 @@ def track(
         Amplitude of the references, um; default: 80% of the mean model's reach.
     voltage
         Lowest and highest voltage of the amplifier, V; default: what was fitted, and 0 V.
+    slew
+        Its fastest change of the voltage, V/s; at most the stand's.
+    current
+        Its largest current, A; with the capacitance.
+    capacitance
+        The actuator's capacitance, F.
     beyond_training
         Allows voltages beyond those that were fitted, where nothing is known of the error.
     rate
@@ -415,6 +424,9 @@ def track(
     theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
     alone = posterior.for_record(dataset.name)
     parameters = alone.noise_of_new(theta[:draws])
+    limits = amplifier_limits(
+        study, voltage, slew, current, capacitance, beyond_training=beyond_training
+    )
     instruments, count = study.record.instruments, len(parameters)
     rng = study.generator("instruments")
     displacements = instruments.displacements(count, alone.single_record.extent, rng)
@@ -426,7 +438,7 @@ def track(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(theta[:draws]),
         LoopNoise(dataset.noise, parameters),
-        Stand(amplifier_limits(study, voltage, beyond_training=beyond_training).span, delay),
+        Stand(limits, delay),
         study.generator("track"),
         robustness=Robustness(gain_margin, phase_margin),
         frequencies=frequencies or None,
