@@ -119,7 +119,9 @@ def test_an_operator_of_ones_own_is_simulated_fast_and_inverted(
 
 def test_a_format_of_ones_own_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the way of any file: by its content, with its units, and in one line where it is cut."""
-    added = formats.Format(b"SCOPE1", ".scp", names_of("my_reader.py")["read_scope"])
+    (tmp_path / "my_reader.py").write_text(example("my_reader.py"), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    added = formats.Format(b"SCOPE1", ".scp", "my_reader:read_scope")
     monkeypatch.setattr(formats, "FORMATS", (*formats.FORMATS, added))
     voltage = np.float32(40 * np.sin(np.arange(300) / 20))
     content = b"SCOPE1" + struct.pack("<d", 2e-3) + np.stack([voltage, 600 * voltage], 1).tobytes()

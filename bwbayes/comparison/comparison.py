@@ -28,7 +28,6 @@ from bwbayes.comparison.evidence import Evidence, Part
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.scores import Scores
 from bwbayes.report.report import (
     UNKNOWN,
     Banner,
@@ -64,8 +63,8 @@ class Candidate:
         Number of training readings.
     hysteresis
         Whether it has any hysteresis.
-    held_out, scores
-        Bands of what was held out and measured, and their scores by the bands' name.
+    held_out
+        Bands of what was held out and measured.
     standing
         Whether its run's bands hold; None if that was not worked out.
     parts
@@ -87,7 +86,6 @@ class Candidate:
     readings: int
     hysteresis: bool = True
     held_out: tuple[Bands, ...] = ()
-    scores: Mapping[str, Scores] = field(default_factory=dict)
     standing: ValidationSummary | None = None
     parts: Mapping[str, Part] = field(default_factory=dict)
     evidence: Evidence | None = None
@@ -125,7 +123,7 @@ class Candidate:
         counts = np.array([np.sum(b.scored(b.measured)) for b in self.held_out], dtype=np.float64)
         if not counts.sum():
             return None
-        shares, scores = counts / counts.sum(), [self.scores[b.name] for b in self.held_out]
+        shares, scores = counts / counts.sum(), [b.scores for b in self.held_out if b.scores]
         covered, errors = (
             np.array([dict(values["sensor"] or {})[95] for values in several])
             for several in ([s.coverage for s in scores], [s.coverage_error for s in scores])
@@ -151,7 +149,7 @@ class Candidate:
             "readings": self.readings,
             "validation": None if self.standing is None else self.standing.status,
             "held_out": self.mean,
-            "windows": {name: scores.numbers for name, scores in self.scores.items()},
+            "windows": {b.name: b.scores.numbers for b in self.held_out if b.scores},
             "parts": {
                 name: {
                     "log_score": float(np.sum(section.log_scores)),

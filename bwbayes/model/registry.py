@@ -6,10 +6,10 @@ import path, ``module:Class``.
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
+from pkgutil import resolve_name
 from typing import Any
 
 from bwbayes.errors import InputError, suggestion
@@ -18,15 +18,8 @@ from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator
 from bwbayes.model.stage import Stage
 
-
-def imported(path: str) -> Any:
-    """Return what is at an import path, ``module:Class``."""
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
-
-
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
-    name: imported(f"bwbayes.model.operators.{path}")
+    name: resolve_name(f"bwbayes.model.operators.{path}")
     for name, path in {
         "bouc-wen": "bouc_wen:BoucWen",
         "bouc-wen-asymmetric": "bouc_wen_asymmetric:BoucWenAsymmetric",
@@ -60,7 +53,7 @@ DYNAMICS: Mapping[str, Callable[..., Filter]] = {
 STAGES: Mapping[str, Callable[..., Stage]] = {
     stage.name: stage
     for stage in (
-        imported(f"bwbayes.model.stages.{path}")
+        resolve_name(f"bwbayes.model.stages.{path}")
         for path in (
             "delay:Delay",
             "lags:AmplifierLag",
@@ -105,7 +98,7 @@ def _maker_of[Part](
     if ":" not in name:
         raise InputError(f"{where}: {name!r} is unknown; {suggestion(name, registry)}")
     try:
-        maker: Callable[..., Part] = imported(name)
+        maker: Callable[..., Part] = resolve_name(name)
     except Exception as error:  # a module from outside may raise anything
         reason = f"{type(error).__name__}: {error}"
         module = name.partition(":")[0]

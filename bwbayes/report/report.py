@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from bwbayes.diagnosis.validation import ValidationSummary
     from bwbayes.inference.parameters import Parameter
-    from bwbayes.prediction.scores import Scores
+    from bwbayes.prediction.bands import Scores
     from bwbayes.record.record import Record
 
 # A figure of matplotlib, which is loaded when something is drawn.

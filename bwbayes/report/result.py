@@ -24,10 +24,9 @@ from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.diagnosis.validation import BandValidation, ValidationSummary
 from bwbayes.errors import Renamed
 from bwbayes.inference.parameters import Parameter
-from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.bands import Bands, Scores
 from bwbayes.prediction.budget import Budget
 from bwbayes.prediction.loops import Loops
-from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import StepResponse
 from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.sampling.diagnostics import SamplingResult
@@ -50,8 +49,8 @@ class Result:
         are the chain's made wider, and the density is that of the chain's own.
     moves
         Numbers of proposals to a walker for these draws, and of acceptances, by kind of move.
-    predictions, scores, validation
-        All predicted bands; scores and validation of those with readings, by the bands' names.
+    predictions, validation
+        All predicted bands; the validation of those with readings, by the bands' names.
         They are empty unless converged, and so are all results below.
     innovations, drive_locks, consistency, explanations, posterior_checks
         By fitted record: the innovation of each reading at the most probable draw; the test whether
@@ -83,7 +82,6 @@ class Result:
     log_density: FloatArray
     moves: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     predictions: tuple[Bands, ...] = ()
-    scores: Mapping[str, Scores] = field(default_factory=dict)
     validation: Mapping[str, BandValidation] = field(default_factory=dict)
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     drive_locks: Mapping[str, DriveLock] = field(default_factory=dict)
@@ -116,6 +114,11 @@ class Result:
     def flat_draws(self) -> FloatArray:
         """All draws, (draws, free)."""
         return self.draws.reshape(-1, self.draws.shape[-1])
+
+    @property
+    def scores(self) -> dict[str, Scores]:
+        """Scores of the bands that have readings, by name."""
+        return {b.name: b.scores for b in self.predictions if b.scores is not None}
 
     @property
     def looped(self) -> list[Bands]:

@@ -19,10 +19,9 @@ from bwbayes.diagnosis.identifiability import InformationGain
 from bwbayes.diagnosis.predictive_checks import STATISTICS
 from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.prediction.bands import LEVELS, Bands
+from bwbayes.prediction.bands import LEVELS, Bands, Scores
 from bwbayes.prediction.budget import TYPES, Budget
 from bwbayes.prediction.loops import MEASURES, Estimate, Loops
-from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
 from bwbayes.report.calibration import outcome
 from bwbayes.report.figures import Pictures, pictures as all_pictures

@@ -1,7 +1,7 @@
 """A small finished run to draw and to report, made up without any sampling."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.declaration import Distribution
-from bwbayes.prediction.bands import KINDS, Bands
-from bwbayes.prediction.scores import Scores
+from bwbayes.prediction.bands import KINDS, Bands, Scores
 from bwbayes.report.figures import draw_styled, pictures, plots_of
 from bwbayes.report.outputs import render
 from bwbayes.report.result import Result, summary
@@ -77,6 +76,14 @@ def scores(truth: bool = True) -> Scores:
     )
 
 
+def scored(every: Iterable[Bands], known: Scores) -> tuple[Bands, ...]:
+    """Give bands with readings these scores."""
+    return tuple(
+        bands if bands.measured is None else dataclasses.replace(bands, scores=known)
+        for bands in every
+    )
+
+
 def draws(steps: int = 120, walkers: int = 10) -> FloatArray:
     """Draw independently: (steps, 4, walkers, 4)."""
     return MEANS + SDS * np.random.default_rng(1).standard_normal((steps, 4, walkers, 4))
@@ -120,8 +127,7 @@ def run(
         draws=values,
         log_density=np.zeros(values.shape[:3]),
         moves={"differential evolution": (1000, 123), "mixture": (3800, 1221)},
-        predictions=every,
-        scores={b.name: scores() for b in every if b.measured is not None},
+        predictions=scored(every, scores()),
         facts={"record": "made up", "drive": "-100 to 100 V"},
         remarks=("the sensor was clipped",),
         truth={"d": 0.7, "lag": 2e-3},

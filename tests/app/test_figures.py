@@ -244,8 +244,7 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
     with open_figure_worker(2) as figure_worker:
         if figure_worker.pool is None:
             pytest.skip("this machine has one core")
-        figure_worker.draw(dataclasses.replace(run, predictions=(), scores={}, innovations={}))
-        figure_worker.draw(dataclasses.replace(run, scores={}))
+        figure_worker.draw(dataclasses.replace(run, predictions=(), innovations={}))
         drawn, plots = figure_worker.collect(run, tmp_path / "apart")
     here = {name: picture_of(picture.draw) for name, picture in pictures(run).items()}
     save_pictures(here, tmp_path / "here")

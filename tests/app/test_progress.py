@@ -275,7 +275,6 @@ def test_a_run_tells_what_share_is_done_until_its_last_file(copy: RunFolder) -> 
     open_finished(copy).compute(steps)
     steps.require(
         "predictions",
-        "scores",
         "innovations",
         "loops",
         "explanations",

@@ -68,7 +68,13 @@ def test_numbers_of_the_parameters_are_the_summarys() -> None:
 
 def test_scores_are_shown_for_each_of_the_bands() -> None:
     run = example.run()
-    run = dataclasses.replace(run, scores={**run.scores, "held-out": example.scores(truth=False)})
+    run = dataclasses.replace(
+        run,
+        predictions=(
+            run.predictions[0],
+            *example.scored(run.predictions[1:], example.scores(truth=False)),
+        ),
+    )
     text = page(run)
     coverage = "48.1 ± 4.1, 89.2 ± 2.2, 94.3 ± 1.3%"
     expected = ["–", "1.23%", "5.52 µm", "6.13 µm", coverage]
@@ -205,8 +211,8 @@ def test_priors_are_listed_with_what_the_constraints_leave_of_them() -> None:
 
 def test_what_is_not_known_has_no_row() -> None:
     run = example.run()
-    unknown = dict.fromkeys(run.scores, example.scores(truth=False))
-    table = rows(page(dataclasses.replace(run, scores=unknown)), "scores")
+    unknown = example.scored(run.predictions, example.scores(truth=False))
+    table = rows(page(dataclasses.replace(run, predictions=unknown)), "scores")
     assert 10 == len(table)
     assert not any("displacement" in row or {"–"} >= set(cells) for row, cells in table.items())
     without = dataclasses.replace(run.outcome.check, pareto_k=None)

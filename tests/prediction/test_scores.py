@@ -8,8 +8,7 @@ from scipy.stats import norm
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.prediction.bands import LEVELS, Bands, Kind
-from bwbayes.prediction.scores import score
+from bwbayes.prediction.bands import LEVELS, Bands, Kind, score
 from tests.prediction.records import normal_bands
 from tests.stand import process
 

@@ -64,7 +64,6 @@ if TYPE_CHECKING:
     from bwbayes.prediction.bands import Bands
     from bwbayes.prediction.budget import Budget
     from bwbayes.prediction.loops import Loops
-    from bwbayes.prediction.scores import Scores
     from bwbayes.prediction.steps import StepResponse
     from bwbayes.quantities import Quantities
     from bwbayes.report.report import Report
@@ -301,17 +300,6 @@ class Run(Shown):
         from bwbayes.app.running.predictions import correct_failed, predictions
 
         return correct_failed(self, predictions(self, watch))
-
-    @RunStage
-    def scores(self, watch: Watch) -> dict[str, Scores]:
-        """Return the scores of all bands with a measurement, by name."""
-        from bwbayes.prediction.scores import score
-
-        return {
-            bands.name: score(bands, self.background.extent)
-            for bands in watched(self.predictions, watch)
-            if bands.scored(bands.measured).any()
-        }
 
     @RunStage
     def innovations(self, watch: Watch) -> dict[str, Innovations]:
@@ -598,7 +586,6 @@ class Run(Shown):
         return {
             bands.name: Prediction(
                 **vars(bands),
-                scores=self.scores.get(bands.name),
                 validation=self.validation.get(bands.name),
             ).said_in(self.quantities)
             for bands in self.predictions

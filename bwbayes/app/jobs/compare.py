@@ -36,7 +36,6 @@ from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.study import Study
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
-from bwbayes.prediction.scores import score
 from bwbayes.record import Record
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.watching import WatchSteps, unwatched
@@ -219,7 +218,7 @@ def _candidate(
     bands = [
         prediction
         for prediction in predictions(fit, partial(watch, f"{name}: predictions"), training=False)
-        if prediction.measured is not None
+        if prediction.scores is not None
     ]
     windows = {record: study.held_out(record) for record in study.records}
     rng = study.generator("future")
@@ -234,11 +233,9 @@ def _candidate(
         scores = bands_part(prediction)
         if scores is not None and study.validations[prediction.name].record is not None:
             parts[prediction.name] = scores
-    extent = max(dataset.extent for dataset in posterior.datasets)
     return replace(
         plain,
         held_out=tuple(bands),
-        scores={p.name: score(p, extent) for p in bands},
         parts=parts,
         evidence=evidence(
             posterior,

@@ -43,7 +43,6 @@ from bwbayes.prediction.prediction import (
     predict_record,
     predict_windows,
 )
-from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.record.voltage_path import estimate_path
@@ -66,15 +65,13 @@ from bwbayes.watching import Watch, part, unwatched
 class Prediction(Product, Bands):
     """Bands of one record or window, and how they turned out.
 
-    ``scores`` and ``validation`` hold the bands against the readings and are None without any;
-    ``remarks`` say where the drive leaves what was fitted, ``hints`` what may be known of it and
-    was not stated; ``run_validation`` is that of the run's own bands. All else is as of
-    :class:`bwbayes.Bands`.
+    ``validation`` holds the bands against the readings and is None without any; ``remarks`` say
+    where the drive leaves what was fitted, ``hints`` what may be known of it and was not stated;
+    ``run_validation`` is that of the run's own bands. All else is as of :class:`bwbayes.Bands`.
     """
 
     NAME: ClassVar[str] = "prediction"
 
-    scores: Scores | None = None
     validation: BandValidation | None = None
     remarks: tuple[str, ...] = ()
     hints: tuple[str, ...] = ()
@@ -224,7 +221,7 @@ def predict_another(
     beyond = beyond_training(run.study.posterior, other.record.inputs)
     bands = _of_another(run, run.subset, other, name, beyond, part(watch, 0.0, 0.8))
     verdict = validate_bands(bands, run.background, beyond=beyond)
-    scores = None if verdict is None else score(bands, run.background.extent)
+    bands = bands.judged(run.background.extent)
     from_rest_note = _from_rest_remark(run, other, bands, beyond)
     watch(1.0)
     noise = other.record.path.remark or planned_noise(other.record)
@@ -233,7 +230,7 @@ def predict_another(
     remarks = tuple(note for note in notes if note)
     if verdict is None or not verdict.passed:
         bands = replace(bands, correction=_of_drives_alike(run, held_out, beyond))
-    return Prediction(**vars(bands), scores=scores, validation=verdict, remarks=remarks)
+    return Prediction(**vars(bands), validation=verdict, remarks=remarks)
 
 
 def correct_failed(run: Run, bands: Sequence[Bands]) -> tuple[Bands, ...]:
@@ -396,7 +393,7 @@ def predictions(run: Run, watch: Watch = unwatched, *, training: bool = True) ->
             beyond, predicting = run.extrapolations[name], next(watches)
             bands.append(_of_another(run, run.subset, held_out, name, beyond, predicting))
     watch(1.0)
-    return tuple(bands)
+    return tuple(predicted.judged(run.background.extent) for predicted in bands)
 
 
 def _of_another(

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
@@ -28,8 +29,6 @@ from bwbayes.record.io.binary import (
     MatVersion,
     read_hdf5,
     read_mat,
-    read_netcdf,
-    read_tdms,
     write_hdf5,
     write_mat,
 )
@@ -44,19 +43,22 @@ _BINARY = (".h5", ".hdf5", ".mat")
 
 
 class Format(NamedTuple):
-    """A file format: the first bytes of its content, the suffix of its names, and its reader."""
+    """A file format: the first bytes of its content, the suffix of its names, and its reader.
+
+    The reader goes by its import path, ``module:function``, and is loaded when it is needed.
+    """
 
     mark: bytes
     suffix: str
-    read: Callable[[Path], Source]
+    reader: str
 
 
 # One line for each format. `_reader` recognizes HDF5, archives and text, which have no fixed start.
-FORMATS: tuple[Format, ...] = (
-    Format(b"\x93NUMPY", ".npy", read_numpy),
-    Format(b"MATLAB", ".mat", read_mat),
-    Format(b"TDSm", ".tdms", read_tdms),
-    Format(b"CDF", ".nc", read_netcdf),
+FORMATS = (
+    Format(b"\x93NUMPY", ".npy", "bwbayes.record.io.series:read_numpy"),
+    Format(b"MATLAB", ".mat", "bwbayes.record.io.binary:read_mat"),
+    Format(b"TDSm", ".tdms", "bwbayes.record.io.binary:read_tdms"),
+    Format(b"CDF", ".nc", "bwbayes.record.io.binary:read_netcdf"),
 )
 # Suffixes of the files that are taken as records in a folder.
 SUFFIXES = (
@@ -248,7 +250,8 @@ def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path
         raise InputError(f"{path}: a workbook or an archive; export it as CSV or .xlsx")
     for file_format in FORMATS:
         if begin.startswith(file_format.mark):
-            return file_format.read
+            read: Callable[[Path], Source] = resolve_name(file_format.reader)
+            return read
     if suffix == ".mat":
         return read_mat
     if suffix in _BINARY:

@@ -127,7 +127,7 @@ def pictures(result: Result) -> Pictures:
             "loops": (result.loops,),
             "steps": (result.step_responses,),
             **{f"bands_{bands.name}": (bands,) for bands in result.predictions},
-            "coverage": (result.scores and result.predictions, result.scores),
+            "coverage": ([b for b in result.predictions if b.scores is not None],),
         }
         several = len(result.innovations) > 1
         for name, innovations in result.innovations.items():

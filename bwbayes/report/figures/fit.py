@@ -20,7 +20,6 @@ from bwbayes.diagnosis.consistency import Consistency
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.prediction.bands import LEVELS, Bands
 from bwbayes.prediction.loops import Loops
-from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import CREEP_FROM, StepResponse
 from bwbayes.report.figures import style
 from bwbayes.report.result import Result
@@ -28,21 +27,21 @@ from bwbayes.report.result import Result
 BAND = "95% parameters"
 
 
-def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) -> Figure:
-    """Draw the coverage of the 50, 90 and 95% bands, and the histogram of the PIT.
+def draw_coverage(scored: Sequence[Bands]) -> Figure:
+    """Draw the coverage of the 50, 90 and 95% bands that have scores, and the histogram of the PIT.
 
     Whiskers are one block-bootstrap standard error either way. If the sensor's distribution is
     right the PIT, its probability below each reading, is uniform: a hump means bands that are too
     wide, a bowl bands that are too narrow, a slope a bias.
     """
-    scored = [bands for bands in predictions if bands.name in scores]
     figure, ((nominal, pit),) = style.new_figure(11, 4.2, 1, 2)
     x = np.arange(len(LEVELS))
     expected: style.Look = {"color": style.Color.EXPECTED, "lw": 1}
     nominal.hlines(LEVELS, x - 0.4, x + 0.4, ls="--", label="nominal", **expected)
     for i, bands in enumerate(scored):
         color, name = style.COLORS[i % len(style.COLORS)], style.plain(bands.title)
-        score, center = scores[bands.name], x + 0.14 * (i - (len(scored) - 1) / 2)
+        assert bands.scores is not None
+        score, center = bands.scores, x + 0.14 * (i - (len(scored) - 1) / 2)
         # Filled markers show bands that a measurement can check, open ones need a simulation.
         for kind, shift, marker, fill in (
             ("sensor", -0.03, "o", "full"),
