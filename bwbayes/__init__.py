@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from bwbayes.app.fit.calls import campaign, compare, fit, open_run, resume
     from bwbayes.app.fit.fitted import Run
     from bwbayes.app.jobs.campaign import Campaign
-    from bwbayes.app.running.predictions import Prediction
+    from bwbayes.app.jobs.predict import Prediction
     from bwbayes.diagnosis.record_checks import inspect
     from bwbayes.errors import InputError, InputWarning, NotConvergedError
     from bwbayes.model.operators.bouc_wen import hysteresis

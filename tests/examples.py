@@ -24,7 +24,7 @@ from bwbayes.record import Record, write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Waveform
 from bwbayes.report.figures import picture_of
-from bwbayes.report.outputs import NO_PLOTS
+from bwbayes.report.result import NO_PLOTS
 from tests.app import small
 from tests.app.specimens import CONFIG, record as specimen, specimens
 
@@ -53,7 +53,7 @@ DEFAULTS = {
     "bwbayes.app.running.explaining.explain": lambda *_, **__: (),
     "bwbayes.report.figures.plots_of": lambda _: NO_PLOTS,
     "bwbayes.report.figures.draw_kind": lambda *_: Figure(),
-    "bwbayes.report.outputs.picture_of": lambda *_: picture_of(Figure),
+    "bwbayes.report.result.picture_of": lambda *_: picture_of(Figure),
     "bwbayes.app.fit.calls.USUAL_MODELS": "linear; bouc-wen",
 }
 OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": False}}

@@ -29,8 +29,13 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.calibration.evaluation import LIMIT, Calibration, evaluate_calibration
-from bwbayes.calibration.replicates import CalibrationSetup, Replicate
+from bwbayes.calibration.calibration import (
+    LIMIT,
+    Calibration,
+    CalibrationSetup,
+    Replicate,
+    evaluate_calibration,
+)
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior

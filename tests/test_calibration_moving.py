@@ -32,8 +32,12 @@ from scipy import stats
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.study.resolve import resolve_config
-from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
-from bwbayes.calibration.replicates import CalibrationSetup, Replicate
+from bwbayes.calibration.calibration import (
+    Calibration,
+    CalibrationSetup,
+    Replicate,
+    evaluate_calibration,
+)
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS

@@ -16,7 +16,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.running.predictions import predictions
+from bwbayes.app.jobs.predict import predictions
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import LEVELS, Bands, Kind

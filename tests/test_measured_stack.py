@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter1d
 import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.fit.fitted import open_finished
+from bwbayes.app.jobs.predict import predictions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import InitialConditions

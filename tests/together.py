@@ -12,7 +12,7 @@ from scipy import linalg, stats
 
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.replicates import CalibrationSetup, Replicate, replicate
+from bwbayes.calibration.calibration import CalibrationSetup, Replicate, replicate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior
 

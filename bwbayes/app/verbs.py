@@ -207,27 +207,29 @@ PAIR = "--voltage FILE and --displacement FILE"
 
 # All other verbs: from a record to a run, many of them, and what there is without any.
 COMMANDS = (
-    Verb("bwbayes.app.commands.fitting:init", either={"RECORD": "RECORD,", "--voltage FILE": PAIR}),
     Verb(
-        "bwbayes.app.commands.fitting:check", either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR}
+        "bwbayes.app.commands.commands:init", either={"RECORD": "RECORD,", "--voltage FILE": PAIR}
     ),
     Verb(
-        "bwbayes.app.commands.fitting:run",
+        "bwbayes.app.commands.commands:check", either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR}
+    ),
+    Verb(
+        "bwbayes.app.commands.commands:run",
         also="bwbayes.app.fit.calls:fit",
         either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR},
     ),
-    Verb("bwbayes.app.commands.fitting:resume", also="bwbayes.app.fit.calls:resume"),
-    Verb("bwbayes.app.commands.fitting:report"),
-    Verb("bwbayes.app.commands.studies:compare", also="bwbayes.app.fit.calls:compare", parts=True),
+    Verb("bwbayes.app.commands.commands:resume", also="bwbayes.app.fit.calls:resume"),
+    Verb("bwbayes.app.commands.commands:report"),
+    Verb("bwbayes.app.commands.commands:compare", also="bwbayes.app.fit.calls:compare", parts=True),
     Verb(
-        "bwbayes.app.commands.studies:campaign",
+        "bwbayes.app.commands.commands:campaign",
         also="bwbayes.app.fit.calls:campaign",
         flags={"resumed": "resume"},
         either={"FOLDER": "a FOLDER of records"},
         instead={"resumed": "--resume CAMPAIGN"},
     ),
     Verb(
-        "bwbayes.app.commands.studies:calibrate",
+        "bwbayes.app.commands.commands:calibrate",
         also="bwbayes.app.jobs.calibrate:resume",
         flags={"resumed": "resume"},
         either={"CONFIG": "a CONFIG"},
@@ -235,12 +237,12 @@ COMMANDS = (
     ),
     Verb("bwbayes.app.jobs.simulate:simulate"),
     Verb(
-        "bwbayes.app.config.reference:config_reference",
+        "bwbayes.app.config.config:config_reference",
         command="config",
         flags={"requested": "KEY"},
     ),
     Verb(
-        "bwbayes.app.config.reference:parts_reference",
+        "bwbayes.app.config.config:parts_reference",
         command="models",
         flags={"requested": "NAME"},
         parts=True,

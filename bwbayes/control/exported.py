@@ -48,8 +48,8 @@ from bwbayes.model.inputs import Limits
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.quantities import DEFAULT
 from bwbayes.record.instruments import EXACT, Instruments
-from bwbayes.report.outputs import refuse_existing, write_summary
 from bwbayes.report.report import Facts, Product, Report
+from bwbayes.report.result import refuse_existing, write_summary
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
 

@@ -2,8 +2,8 @@
 
 A :class:`Defect` has one name. It holds the kind of finding of the record check, the stage of the
 model that describes it, the starting points of that stage's fit, and its text and fix: for a fit
-with the defect, and for failing bands with it (:mod:`bwbayes.diagnosis.causes`). Each stage of the
-registry has a defect, so that new stages are tried without further code.
+with the defect, and for failing bands with it (:mod:`bwbayes.diagnosis.departures`). Each stage of
+the registry has a defect, so that new stages are tried without further code.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from bwbayes.model.declaration import Distribution, normal
 from bwbayes.model.registry import STAGES
 from bwbayes.model.stages.additions import Oscillation
 from bwbayes.model.stages.delay import Delay
-from bwbayes.model.stages.reversed_sign import ReversedSign
+from bwbayes.model.stages.sensor import ReversedSign
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 

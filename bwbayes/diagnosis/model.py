@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.conflict import conflict_fix
+from bwbayes.diagnosis.consistency import conflict_fix
 from bwbayes.diagnosis.residual_analysis import (
     Explanation,
     ResidualAnalysis,

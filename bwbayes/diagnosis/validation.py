@@ -9,7 +9,7 @@ displacement's range.
 
 A failed validation names the likely cause: on fitted readings the explanation with the best
 evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the residuals
-(:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, if the best
+(:mod:`bwbayes.diagnosis.departures`). A fit has not passed, whatever its bands cover, if the best
 explanation is an effect that does not come from the actuator, such as a transient, a drift or
 outliers: the parameters may have followed it. It has not passed either if a better model is known:
 held-out readings have the drive of the fitted ones, and there a discrepancy takes up the model's
@@ -29,9 +29,8 @@ from typing import Any, Self
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import LEAD_IN_ALARM, UNEXPLAINED, cause
 from bwbayes.diagnosis.defects import DEFECTS
-from bwbayes.diagnosis.departures import StandardizedResiduals
+from bwbayes.diagnosis.departures import LEAD_IN_ALARM, UNEXPLAINED, StandardizedResiduals, cause
 from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
 from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding, join_findings
 from bwbayes.diagnosis.residual_analysis import Explanation

@@ -7,8 +7,7 @@ from itertools import product
 
 from markupsafe import Markup
 
-from bwbayes.calibration.evaluation import FAMILY_LEVEL, JUDGED_FROM, Calibration
-from bwbayes.calibration.replicates import RANKED
+from bwbayes.calibration.calibration import FAMILY_LEVEL, JUDGED_FROM, RANKED, Calibration
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.report import (
     Banner,

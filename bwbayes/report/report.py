@@ -1,7 +1,7 @@
 """Reports of products: a title, banners, tables, figures and texts, in their order.
 
 A :class:`Product` describes itself by a :class:`Report`. :func:`show` shows it on a terminal of 80
-columns, :mod:`~bwbayes.report.outputs` as a page, whose files it writes. The page shows the whole
+columns, :mod:`~bwbayes.report.result` as a page, whose files it writes. The page shows the whole
 report. The screen shows the banners, and the tables and texts that are meant for it. A text is
 escaped when it is shown; a :class:`~markupsafe.Markup` counts as HTML. Numbers are written as
 exactly as they are known, and symbols in plain characters.
@@ -398,7 +398,7 @@ class Shown:
         return "\n".join(filter(None, [self.heading, as_text(self.full_report())]))
 
     def _repr_html_(self) -> str:
-        from bwbayes.report.outputs import fragment  # noqa: PLC0415  # slow to load
+        from bwbayes.report.result import fragment  # noqa: PLC0415  # slow to load
 
         report = self.full_report()
         return fragment(replace(report, title=self.heading or report.title))
@@ -439,7 +439,7 @@ class Product(Shown):
         Raises InputError: a file that exists, unless it may be replaced, or that cannot be written.
         """
         from bwbayes.record.io.formats import write_record  # noqa: PLC0415
-        from bwbayes.report.outputs import refuse_existing, save  # noqa: PLC0415
+        from bwbayes.report.result import refuse_existing, save  # noqa: PLC0415
 
         folder = Path(folder)
         records = {

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from bwbayes.diagnosis.conflict import effective
+from bwbayes.diagnosis.consistency import effective
 from bwbayes.diagnosis.identifiability import InformationGain
-from bwbayes.diagnosis.predictive_checks import STATISTICS
+from bwbayes.diagnosis.innovations import STATISTICS
 from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.prediction.bands import LEVELS, Bands, Scores

@@ -12,8 +12,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.model.declaration import Distribution
 from bwbayes.prediction.bands import KINDS, Bands, Scores
 from bwbayes.report.figures import draw_styled, pictures, plots_of
-from bwbayes.report.outputs import render
-from bwbayes.report.result import Result, summary
+from bwbayes.report.result import Result, render, summary
 from bwbayes.report.run import run_report
 from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult
 from tests.declared import declared

@@ -79,8 +79,8 @@ def typed(command: click.Command, *words: object) -> int:
 
 def without_pictures(patch: pytest.MonkeyPatch) -> None:
     """Spare the time that pictures take, where they are not what is tested: products' are blank."""
-    patch.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
-    for module in ("bwbayes.report.outputs", "bwbayes.app.running.predictions"):
+    patch.setattr("bwbayes.app.running.workers._works", lambda _: {})
+    for module in ("bwbayes.report.result", "bwbayes.app.jobs.predict"):
         patch.setattr(f"{module}.picture_of", lambda *_: picture_of(Figure))
 
 

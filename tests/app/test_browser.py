@@ -18,7 +18,7 @@ from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.comparison.design import Design, DesignScore
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.model.inputs import Limits
-from bwbayes.report.outputs import render
+from bwbayes.report.result import render
 from tests.app import example, small
 from tests.programs import needs
 

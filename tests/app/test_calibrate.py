@@ -17,7 +17,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import resume, start
 from bwbayes.app.running.fingerprint import state_of
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
-from bwbayes.calibration.replicates import CalibrationSetup
+from bwbayes.calibration.calibration import CalibrationSetup
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import KINDS, LEVELS

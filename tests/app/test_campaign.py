@@ -23,8 +23,7 @@ from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.report.outputs import write_summary
-from bwbayes.report.result import summary
+from bwbayes.report.result import summary, write_summary
 from tests.app import small
 from tests.app.conftest import Type
 from tests.app.specimens import CONFIG, record, specimens

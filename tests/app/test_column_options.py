@@ -16,7 +16,7 @@ from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.study.records import open_like, record_naming
+from bwbayes.app.study.from_config import open_like, record_naming
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.io.columns import Naming
@@ -205,7 +205,7 @@ def test_predict_reads_a_second_file_once(
         opened.append(path)
         return read_source(path, table)
 
-    for module in ("bwbayes.record.io.formats", "bwbayes.app.study.records"):
+    for module in ("bwbayes.record.io.formats", "bwbayes.app.study.from_config"):
         monkeypatch.setattr(f"{module}.read_source", read)
     fit = bw.open_run(copy.path)
     _ = fit.study  # reads the files of the run itself

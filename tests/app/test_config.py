@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from bwbayes.app.config.config import dump, is_config, load, parse
-from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.config.settings import ModelConfig
+from bwbayes.app.fit.calls import config_of, models_of
 from bwbayes.errors import InputError
 from bwbayes.record.record import Record
 

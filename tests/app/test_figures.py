@@ -20,13 +20,12 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from bwbayes.app.running.figure_worker import FigureWorker, open_figure_worker
+from bwbayes.app.running.workers import FigureWorker, open_figure_worker
 from bwbayes.report.figures import interactive, picture_of, pictures, plots_of, save_pictures
 from bwbayes.report.figures.fit import _rank_heights, draw_trace
 from bwbayes.report.figures.series import _around_largest_error, draw_bands, draw_loop
 from bwbayes.report.figures.style import Color, envelope, zigzag
-from bwbayes.report.outputs import NO_PLOTS
-from bwbayes.report.result import Result
+from bwbayes.report.result import NO_PLOTS, Result
 from tests.app import example
 
 

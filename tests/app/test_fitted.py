@@ -16,12 +16,11 @@ from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running import run
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.diagnosis.drive_lock import DriveLock
-from bwbayes.diagnosis.rivals import Rival
+from bwbayes.diagnosis.rivals import DriveLock, Rival
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.record import Record, read_record
-from bwbayes.report.outputs import write_bands
 from bwbayes.report.report import digits
+from bwbayes.report.result import write_bands
 from tests.app import small
 
 

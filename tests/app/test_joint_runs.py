@@ -10,13 +10,13 @@ import pytest
 
 import bwbayes
 from bwbayes.app.config.config import parse
-from bwbayes.app.config.keywords import config_of
+from bwbayes.app.fit.calls import config_of
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.study.resolve import resolve_config
-from bwbayes.calibration.replicates import replicate
+from bwbayes.calibration.calibration import replicate
 from bwbayes.errors import InputError
 from bwbayes.record import Record, write_record
 from bwbayes.report.figures import pictures

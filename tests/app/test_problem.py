@@ -15,7 +15,7 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.study import resolve as resolve_module
 from bwbayes.app.study.about import findings_of
-from bwbayes.app.study.records import windows_of
+from bwbayes.app.study.from_config import windows_of
 from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter

@@ -9,9 +9,8 @@ import tomllib
 
 import pytest
 
-from bwbayes.app.config.config import Config, parse
+from bwbayes.app.config.config import PARTS, Config, config_reference, parse, parts_reference
 from bwbayes.app.config.keys import ANY, Key, keys
-from bwbayes.app.config.reference import PARTS, config_reference, parts_reference
 from bwbayes.errors import InputError
 
 EVERY = {key.path: key for key in keys(Config)}

@@ -15,7 +15,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.config.config import load
-from bwbayes.app.config.keywords import config_of
+from bwbayes.app.fit.calls import config_of
 from bwbayes.app.running.explaining import search_stages
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray

@@ -9,8 +9,8 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run
+from bwbayes.app.jobs.predict import planned_noise
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import planned_noise
 from bwbayes.app.running.run import resume
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError

@@ -19,8 +19,7 @@ from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
-from bwbayes.model.operators.maxwell_slip import MaxwellSlip
-from bwbayes.model.operators.prandtl_ishlinskii import Plays
+from bwbayes.model.operators.prandtl_ishlinskii import MaxwellSlip, Plays
 from bwbayes.record.waveforms import signal
 from tests.benchmarks.measuring import ROOT, Call, Cell, Table, interleaved
 from tests.benchmarks.stock import stock

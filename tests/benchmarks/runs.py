@@ -28,7 +28,7 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.running.workers import open_executor
 from bwbayes.app.study.resolve import resolve_config
-from bwbayes.calibration.replicates import replicate
+from bwbayes.calibration.calibration import replicate
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import generator

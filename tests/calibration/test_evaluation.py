@@ -10,15 +10,16 @@ import pytest
 from scipy.special import ndtr
 
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.evaluation import (
+from bwbayes.calibration.calibration import (
     FAMILY_LEVEL,
+    RANKED,
     Calibration,
+    Entry,
     evaluate_calibration,
     holm,
     smooth_power,
     smooth_test,
 )
-from bwbayes.calibration.replicates import RANKED, Entry
 from bwbayes.errors import InputError
 
 NAMES = tuple("abcdefghijkl")

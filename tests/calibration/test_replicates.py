@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration import replicates as module
-from bwbayes.calibration.evaluation import Calibration, evaluate_calibration, smooth_power
-from bwbayes.calibration.replicates import (
+from bwbayes.calibration import calibration as module
+from bwbayes.calibration.calibration import (
     RANKED,
+    Calibration,
     CalibrationSetup,
     Replicate,
     Sampled,
+    evaluate_calibration,
     replicate,
+    smooth_power,
 )
 from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import resolve_engine

@@ -13,9 +13,8 @@ from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
-from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
-from bwbayes.model.operators.prandtl_ishlinskii import Plays
+from bwbayes.model.operators.prandtl_ishlinskii import MaxwellSlip, Plays
 
 SPAN = Span(-100.0, 100.0)
 HOLDS: tuple[Hold, ...] = ("first", "zero")

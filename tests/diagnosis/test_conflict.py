@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.conflict import conflicts
+from bwbayes.diagnosis.consistency import conflicts
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.model.declaration import Distribution, Ranges
 from tests.declared import context, declared, joint, parameter

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.drive_lock import (
+from bwbayes.diagnosis.rivals import (
     DriveLock,
     compare,
     drive_features,

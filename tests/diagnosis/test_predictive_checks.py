@@ -11,8 +11,14 @@ import pytest
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.innovations import Innovations, departures, innovations
-from bwbayes.diagnosis.predictive_checks import STATISTICS, PredictiveChecks, check_predictions
+from bwbayes.diagnosis.innovations import (
+    STATISTICS,
+    Innovations,
+    PredictiveChecks,
+    check_predictions,
+    departures,
+    innovations,
+)
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Posterior
 from tests.inference import problems

@@ -9,12 +9,11 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
+from bwbayes.app.jobs.predict import Prediction, predict_after, predict_another
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.laplace import climb
-from bwbayes.diagnosis.rivals import Rival, families, fit_rivals
+from bwbayes.diagnosis.rivals import Rival, drive_locks, families, fit_rivals
 from bwbayes.inference import map_estimate
 from bwbayes.inference.study import generator
 from bwbayes.model.spec import ModelSpec

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import assume, given, strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import cause
 from bwbayes.diagnosis.defects import DEFECTS
-from bwbayes.diagnosis.departures import StandardizedResiduals
+from bwbayes.diagnosis.departures import StandardizedResiduals, cause
 from bwbayes.diagnosis.explanations import LIMIT
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation

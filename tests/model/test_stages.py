@@ -34,9 +34,9 @@ from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
+from bwbayes.model.stages.amplifier_limits import Saturation
 from bwbayes.model.stages.covariates import Temperature
 from bwbayes.model.stages.delay import Delay
-from bwbayes.model.stages.saturation import Saturation
 from bwbayes.record.teststand import RING_BENDER, true_values
 from tests.control.compiled import Compiled
 from tests.programs import needs

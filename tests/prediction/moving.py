@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import LEAD_IN_ALARM
+from bwbayes.diagnosis.departures import LEAD_IN_ALARM
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator

@@ -14,8 +14,8 @@ from arviz_stats.base import array_stats  # not in an __all__
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.fit.fitted import Run
+from bwbayes.app.jobs.predict import validate_predictions
 from bwbayes.app.running.explaining import chosen_noise, explain_record
-from bwbayes.app.running.predictions import validate_predictions
 from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import BandValidation

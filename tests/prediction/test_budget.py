@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.replicates import replicate
+from bwbayes.calibration.calibration import replicate
 from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.prediction.budget import (
     AMPLIFIER,

@@ -26,7 +26,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import LEAD_IN_ALARM
+from bwbayes.diagnosis.departures import LEAD_IN_ALARM
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.operator import Operator

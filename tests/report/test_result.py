@@ -13,9 +13,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.errors import Renamed
 from bwbayes.prediction.bands import Bands
-from bwbayes.report.outputs import write_bands
 from bwbayes.report.report import Report, Table, as_text, length_text
-from bwbayes.report.result import Result, summary
+from bwbayes.report.result import Result, summary, write_bands
 from bwbayes.sampling.diagnostics import check
 from tests.app import example
 from tests.app.example import bands

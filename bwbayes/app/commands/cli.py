@@ -23,7 +23,7 @@ from typing import Any
 
 import click
 
-from bwbayes.app.commands.shared import as_typed
+from bwbayes.app.commands.command import as_typed
 from bwbayes.app.verbs import COMMANDS, VERBS
 from bwbayes.errors import ColumnsError, ExitStatus, InputError, NotConvergedError, one_line
 

@@ -46,19 +46,16 @@ if TYPE_CHECKING:
     )
     from bwbayes.app.jobs.design import design as design_fit
     from bwbayes.app.jobs.fit_methods import Scratch, fit_method
-    from bwbayes.app.jobs.predict import predict as predict_record
-    from bwbayes.app.running.figure_worker import FigureWorker
-    from bwbayes.app.running.predictions import Prediction
+    from bwbayes.app.jobs.predict import Prediction, predict as predict_record
+    from bwbayes.app.running.workers import FigureWorker
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.comparison import Comparison
     from bwbayes.diagnosis.consistency import Consistency
-    from bwbayes.diagnosis.drive_lock import DriveLock
     from bwbayes.diagnosis.finding import Finding
     from bwbayes.diagnosis.identifiability import InformationGain
-    from bwbayes.diagnosis.innovations import Innovations
-    from bwbayes.diagnosis.predictive_checks import PredictiveChecks
+    from bwbayes.diagnosis.innovations import Innovations, PredictiveChecks
     from bwbayes.diagnosis.residual_analysis import Explanation
-    from bwbayes.diagnosis.rivals import Rival
+    from bwbayes.diagnosis.rivals import DriveLock, Rival
     from bwbayes.diagnosis.validation import BandValidation, ValidationContext, ValidationSummary
     from bwbayes.inference.study import Study
     from bwbayes.prediction.bands import Bands
@@ -143,7 +140,7 @@ class Run(Shown):
     @cached_property
     def plan(self) -> SamplingPlan:
         """How it is sampled."""
-        from bwbayes.app.study.parameters import plan_of
+        from bwbayes.app.study.from_config import plan_of
 
         return plan_of(self.config, self.study.posterior)
 
@@ -297,7 +294,7 @@ class Run(Shown):
 
         Those of held-out readings that fail validation have their correction.
         """
-        from bwbayes.app.running.predictions import correct_failed, predictions
+        from bwbayes.app.jobs.predict import correct_failed, predictions
 
         return correct_failed(self, predictions(self, watch))
 
@@ -331,14 +328,14 @@ class Run(Shown):
     @RunStage
     def uncertainty_budgets(self, _: Watch) -> tuple[Budget, ...]:
         """Return which source has which share of what is not known of the main quantities."""
-        from bwbayes.app.running.budgeting import run_budgets
+        from bwbayes.app.jobs.certificate import run_budgets
 
         return run_budgets(self)
 
     @RunStage
     def drive_locks(self, _: Watch) -> dict[str, DriveLock]:
         """Return whether what the model misses follows the drive, by record."""
-        from bwbayes.diagnosis.drive_lock import drive_locks
+        from bwbayes.diagnosis.rivals import drive_locks
 
         source = self.study.generator("drive lock")
         return drive_locks(self.study.posterior, self.subset, source)
@@ -401,7 +398,7 @@ class Run(Shown):
     @always
     def validation(self, _: Watch) -> dict[str, BandValidation]:
         """Return whether the bands hold, and why not, by the bands' name."""
-        from bwbayes.app.running.predictions import validate_predictions
+        from bwbayes.app.jobs.predict import validate_predictions
 
         if not self.converged:
             return {}
@@ -423,7 +420,7 @@ class Run(Shown):
     @RunStage
     def posterior_checks(self, watch: Watch) -> dict[str, PredictiveChecks]:
         """Return where each record lies among replicated ones."""
-        from bwbayes.diagnosis.predictive_checks import check_predictions
+        from bwbayes.diagnosis.innovations import check_predictions
 
         _ = self.information_gain  # first: it draws from the same source
         posterior, subset, source = self.study.posterior, self.subset, self._check_source
@@ -546,7 +543,7 @@ class Run(Shown):
     @cached_property
     def posterior(self) -> Any:
         """The draws as arviz has them, an xarray.DataTree; its ``converged`` is 1 or 0."""
-        from bwbayes.report.outputs import posterior_tree
+        from bwbayes.report.result import posterior_tree
 
         return posterior_tree(self.sampled, self.log_likelihood, self.study.records)
 
@@ -581,7 +578,7 @@ class Run(Shown):
         NotConvergedError
             The sampling has not converged.
         """
-        from bwbayes.app.running.predictions import Prediction
+        from bwbayes.app.jobs.predict import Prediction
 
         return {
             bands.name: Prediction(

@@ -33,19 +33,20 @@ from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.run import redraw
 from bwbayes.app.running.workers import one_thread
 from bwbayes.app.study.resolve import resolve_config
-from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
-from bwbayes.calibration.replicates import (
+from bwbayes.calibration.calibration import (
     RANKED,
+    Calibration,
     CalibrationSetup,
     Entry,
     Sampled,
+    evaluate_calibration,
     replicate,
 )
 from bwbayes.errors import InputError
 from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.instruments import EXACT
 from bwbayes.report.calibration import calibration_report
-from bwbayes.report.outputs import save
+from bwbayes.report.result import save
 from bwbayes.sampling.chain import draws
 
 

@@ -27,13 +27,13 @@ from rich.console import Console
 from bwbayes.app.config.config import ALONE, dump, parse, read_toml, validated_config
 from bwbayes.app.config.proposal import draft_config
 from bwbayes.app.fit.fitted import Run, open_finished
+from bwbayes.app.jobs.predict import Prediction, predict_another
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
-from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.progress import LastLine, StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
-from bwbayes.app.study.records import open_like
+from bwbayes.app.study.from_config import open_like
 from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import ValidationSummary
@@ -52,7 +52,6 @@ from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import SUFFIXES, read_named
 from bwbayes.report.figures import draw_styled
-from bwbayes.report.outputs import save, write_summary
 from bwbayes.report.report import (
     STATUS_KINDS,
     Banner,
@@ -71,6 +70,7 @@ from bwbayes.report.report import (
     mark,
     unit_text,
 )
+from bwbayes.report.result import save, write_summary
 from bwbayes.shown import brief
 from bwbayes.watching import WatchSteps, unwatched, watched
 

@@ -17,10 +17,10 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.running.explaining import choose_model, explain_record
 from bwbayes.app.study.about import findings_of, lines
 from bwbayes.app.study.resolve import resolve_config
-from bwbayes.diagnosis import conflict, identifiability
+from bwbayes.diagnosis import consistency, identifiability
 from bwbayes.record import Record
-from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
+from bwbayes.report.result import save
 from bwbayes.report.run import priors_table
 from bwbayes.watching import WatchSteps, unwatched
 
@@ -44,12 +44,12 @@ def check(
     run, point, steps, explained = choose_model(resolve_config(config, folder, in_memory), watch)
     study, posterior = run.study, run.study.posterior
     free, _ = posterior.prior.constrain(point.mode[None])
-    likely = conflict.around(posterior.prior, point, study.generator("around"))
+    likely = consistency.around(posterior.prior, point, study.generator("around"))
     # The findings are remarks too, but here they come with what to do.
     findings = findings_of(study)
     shown = {f"{name}: {issue}" for name, issues in findings.items() for issue in issues}
     remarks = [remark for remark in run.record_remarks if remark not in shown]
-    remarks += map(str, conflict.conflicts(posterior.prior, likely, study.defaults))
+    remarks += map(str, consistency.conflicts(posterior.prior, likely, study.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
     if explained is None:
         explaining = partial(watch, "explanations")

@@ -24,8 +24,8 @@ from rich.console import Console
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Run, open_finished
+from bwbayes.app.jobs.predict import predictions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.progress import ProgressLine, StepProgress, batch
 from bwbayes.app.running.run import begin, resume
 from bwbayes.app.running.workers import one_thread, open_executor

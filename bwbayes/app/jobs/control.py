@@ -21,7 +21,7 @@ import numpy as np
 
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import amplifier_limits
-from bwbayes.app.study.records import open_like
+from bwbayes.app.study.from_config import open_like
 from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import Compensation, compensate as compensated
 from bwbayes.control.exported import Exported, exported

@@ -21,7 +21,7 @@ from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import fitted_voltages
-from bwbayes.app.study.records import open_like, sampled_waveform
+from bwbayes.app.study.from_config import open_like, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import Design, DesignScore, RivalDesign, rank_by_rivals, rank_designs
 from bwbayes.diagnosis.extrapolation import PART

@@ -11,7 +11,7 @@ from bwbayes.inference.study import generator
 from bwbayes.record import write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Sine, Waveform, signal as named
-from bwbayes.report.outputs import refuse_existing, write_summary
+from bwbayes.report.result import refuse_existing, write_summary
 
 
 def simulate(

@@ -21,16 +21,15 @@ from rich.console import Console
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run, open_finished
 from bwbayes.app.running.explaining import choose_model
-from bwbayes.app.running.figure_worker import FigureWorker
 from bwbayes.app.running.fingerprint import fingerprint, require_own, save, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
-from bwbayes.app.running.workers import one_thread, open_executor
+from bwbayes.app.running.workers import FigureWorker, one_thread, open_executor
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine, resolve_engine
 from bwbayes.inference.voltage_noise import path_covariance
 from bwbayes.record.io.formats import draft_of
-from bwbayes.report.outputs import render, write_bands, write_summary
+from bwbayes.report.result import render, write_bands, write_summary
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.sampling.storage import ChainFile

@@ -12,8 +12,7 @@ import numpy as np
 from bwbayes.app.config.config import Config
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running import fingerprint
-from bwbayes.diagnosis.conflict import conflicts
-from bwbayes.diagnosis.consistency import disagreements
+from bwbayes.diagnosis.consistency import conflicts, disagreements
 from bwbayes.diagnosis.explanations import TIED, likely_causes
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding

@@ -16,11 +16,12 @@ from pathlib import Path
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import ModelConfig, ParameterConfig, RecordConfig
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.study.parameters import recoverable, study_of
-from bwbayes.app.study.records import (
+from bwbayes.app.study.from_config import (
     join_records,
     record_naming,
+    recoverable,
     require_alike,
+    study_of,
     training_records,
     validations_of,
     windows_of,

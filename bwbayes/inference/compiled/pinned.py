@@ -15,10 +15,9 @@ from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.model.compiled import compiled
 from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import monotone_stretches
-from bwbayes.model.operators import walls as formulas
-from bwbayes.model.operators.pinned import LONGEST, Pinned
+from bwbayes.model.operators import pinned as formulas
+from bwbayes.model.operators.pinned import KNOTS, LINES, LONGEST, STAGES, Pinned
 from bwbayes.model.operators.scalar_memory import StateMemory
-from bwbayes.model.operators.walls import KNOTS, LINES, STAGES
 
 at_rest, moves_from = compiled(formulas.at_rest), compiled(formulas.moves_from)
 first_step, integrate = compiled(formulas.first_step), compiled(formulas.integrate)

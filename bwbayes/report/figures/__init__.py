@@ -25,8 +25,7 @@ from bwbayes.report.report import Picture
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from bwbayes.report.outputs import PagePlots
-    from bwbayes.report.result import Result
+    from bwbayes.report.result import PagePlots, Result
 
 __all__ = [
     "PICTURES",
@@ -68,7 +67,7 @@ def prepare() -> None:
 def plots_of(result: Result) -> PagePlots:
     """Return a run's interactive plots, and the scripts that draw them, if there are any."""
     from bwbayes.report.figures import interactive  # noqa: PLC0415
-    from bwbayes.report.outputs import NO_PLOTS, PagePlots  # noqa: PLC0415
+    from bwbayes.report.result import NO_PLOTS, PagePlots  # noqa: PLC0415
 
     plots = interactive.draw(result) if result.outcome.converged else {}
     return PagePlots(plots, interactive.scripts()) if plots else NO_PLOTS

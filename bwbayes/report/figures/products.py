@@ -18,7 +18,7 @@ from matplotlib.ticker import (
 )
 
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.evaluation import LIMIT, Calibration
+from bwbayes.calibration.calibration import LIMIT, Calibration
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.calibration import EXTRA_WORDS
 from bwbayes.report.figures import style

@@ -15,10 +15,8 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.inputs import Span
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
-from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
-from bwbayes.model.operators.maxwell_slip import MaxwellSlip
-from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
-from bwbayes.model.operators.preisach import Preisach
+from bwbayes.model.operators.prandtl_ishlinskii import MaxwellSlip, Plays, PrandtlIshlinskii
+from bwbayes.model.operators.preisach import KrasnoselskiiPokrovskii, Preisach
 from tests.model.operators.slow import Rows, by_extrema, by_plays, path, rows, run, walk
 
 SPANS = (Span(-100.0, 120.0), Span(-150.0, 90.0), Span(5.0, 160.0), Span(-30.0, -20.0), None)

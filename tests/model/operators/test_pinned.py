@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.operators import walls
+from bwbayes.model.operators import pinned
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from tests.model.operators.slow import by_integration, paths, rows, run
 
@@ -102,7 +102,7 @@ def test_agrees_with_the_equation_as_published(
 
 @pytest.mark.parametrize("y", [0.0, 1e-9, 0.03, 0.7, 0.99999, 1.0, 1.00001, 4.0, 30.0, 1e6])
 def test_the_curve_of_langevin_and_its_inverse(y: float) -> None:
-    level, slope = walls.curve(False, np.array([-y, y]))
+    level, slope = pinned.curve(False, np.array([-y, y]))
     assert level[0] == -level[1]
     # The series to y¹⁵ from Bernoulli's numbers, where it converges fast, or the closed form.
     if y < 0.1:
@@ -118,7 +118,7 @@ def test_the_curve_of_langevin_and_its_inverse(y: float) -> None:
         steepness = 1 / y**2 - (1 / math.sinh(y) ** 2 if y < 300 else 0.0)
     assert float(level[1]) == pytest.approx(expected, rel=5e-14)
     assert float(slope[1]) == pytest.approx(steepness, rel=2e-13)
-    back = walls.curve(False, walls.field_at(False, level))[0]
+    back = pinned.curve(False, pinned.field_at(False, level))[0]
     np.testing.assert_allclose(back, level, rtol=0, atol=1e-15)
 
 
