@@ -207,29 +207,25 @@ PAIR = "--voltage FILE and --displacement FILE"
 
 # All other verbs: from a record to a run, many of them, and what there is without any.
 COMMANDS = (
+    Verb("bwbayes.app.commands.runs:init", either={"RECORD": "RECORD,", "--voltage FILE": PAIR}),
+    Verb("bwbayes.app.commands.runs:check", either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR}),
     Verb(
-        "bwbayes.app.commands.commands:init", either={"RECORD": "RECORD,", "--voltage FILE": PAIR}
-    ),
-    Verb(
-        "bwbayes.app.commands.commands:check", either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR}
-    ),
-    Verb(
-        "bwbayes.app.commands.commands:run",
+        "bwbayes.app.commands.runs:run",
         also="bwbayes.app.fit.calls:fit",
         either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR},
     ),
-    Verb("bwbayes.app.commands.commands:resume", also="bwbayes.app.fit.calls:resume"),
-    Verb("bwbayes.app.commands.commands:report"),
-    Verb("bwbayes.app.commands.commands:compare", also="bwbayes.app.fit.calls:compare", parts=True),
+    Verb("bwbayes.app.commands.runs:resume", also="bwbayes.app.fit.calls:resume"),
+    Verb("bwbayes.app.commands.runs:report"),
+    Verb("bwbayes.app.commands.runs:compare", also="bwbayes.app.fit.calls:compare", parts=True),
     Verb(
-        "bwbayes.app.commands.commands:campaign",
+        "bwbayes.app.commands.runs:campaign",
         also="bwbayes.app.fit.calls:campaign",
         flags={"resumed": "resume"},
         either={"FOLDER": "a FOLDER of records"},
         instead={"resumed": "--resume CAMPAIGN"},
     ),
     Verb(
-        "bwbayes.app.commands.commands:calibrate",
+        "bwbayes.app.commands.runs:calibrate",
         also="bwbayes.app.jobs.calibrate:resume",
         flags={"resumed": "resume"},
         either={"CONFIG": "a CONFIG"},
