@@ -292,12 +292,6 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     return Replicate(entry, drawn)
 
 
-def _together(posterior: Posterior, replicated: Posterior) -> Posterior:
-    """Return the posterior of its own readings and of replicated ones: the same parameters."""
-    datasets = posterior.datasets + replicated.datasets
-    return replace(posterior, datasets=datasets, joint=posterior.table)
-
-
 def _simulated(
     experiment: CalibrationSetup, generator: np.random.Generator
 ) -> tuple[dict[str, FloatArray], dict[str, Simulated]]:
@@ -368,6 +362,12 @@ def _predictions(
         predicted = predict_record(*alone, record, other.start, others, window=other.judged)
         predictions[name] = [(predicted, another, window)]
     return predictions
+
+
+def _together(posterior: Posterior, replicated: Posterior) -> Posterior:
+    """Return the posterior of its own readings and of replicated ones: the same parameters."""
+    datasets = posterior.datasets + replicated.datasets
+    return replace(posterior, datasets=datasets, joint=posterior.table)
 
 
 def _simulated_other(

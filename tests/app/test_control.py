@@ -17,7 +17,7 @@ from bwbayes.control.exported import FILES
 from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.references import build_reference
 from bwbayes.errors import InputError
-from bwbayes.report.outputs import render
+from bwbayes.report.result import render
 from tests.app.conftest import Type
 
 SINE = {"reference": "sine", "amplitude": 1.0, "frequency": 1.0}

@@ -131,6 +131,10 @@ def _text(
     edges = [first, *(edge for window in held for edge in (window.start, window.stop)), last + 1]
     train = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
     source = _source(path, where, naming, record)
+    dynamics = '"none"  # the record has no time'
+    if record.quantities.has_clock:
+        others = ", ".join(_quoted(name) for name in DYNAMICS if name != "lag")
+        dynamics = f'"lag"  # or {others}'
     command = ""
     if naming.units.get("voltage") is None and record.voltage_is == "output":
         command = (
@@ -154,7 +158,7 @@ train = {_windows(record, train)}  # {record.quantities.clock.unit}: fitted
 {fixes["record"]}{_start(record)}
 {command}
 [model]
-dynamics = {_dynamics(record)}
+dynamics = {dynamics}
 {fixes["model"]}
 # Priors come from the record's ranges; `bwbayes check` shows them. To say more:
 # [parameters]
@@ -215,13 +219,6 @@ def _heading(record: Record) -> str:
     heading = f"# {record.origin}: {record.samples} samples{clock}"
     heading += f", {missing} readings missing" if missing else ""
     return f"{heading}\n{record.quantities.say(extent)}"
-
-
-def _dynamics(record: Record) -> str:
-    """Say which dynamics there are."""
-    if not record.quantities.has_clock:
-        return '"none"  # the record has no time'
-    return f'"lag"  # or {", ".join(_quoted(name) for name in DYNAMICS if name != "lag")}'
 
 
 def _start(record: Record) -> str:

@@ -86,7 +86,10 @@ class Delay(Stage):
         """Return the path as late as each model has it, (models, samples)."""
         if seen is None:
             return values, memory
-        return _late(numbers, seen[0], values.shape[1]), memory
+        path, floor = seen[0], np.floor(numbers)
+        after = np.arange(values.shape[1]) - floor.astype(np.intp)
+        late, before = (path[np.clip(at, 0, path.size - 1)] for at in (after, after - 1))
+        return late + (numbers - floor) * (before - late), memory
 
     def inverse(
         self,
@@ -111,12 +114,3 @@ class Delay(Stage):
             command = command[::-1] if backwards else command
             commands[row] = command[np.clip(np.arange(command.size) + late, 0, command.size - 1)]
         return commands
-
-
-def _late(shifts: FloatArray, path: FloatArray, samples: int) -> FloatArray:
-    """Return the first samples of a path (any,), V, late by shifts (models, 1), in samples."""
-    floor = np.floor(shifts)
-    after = np.arange(samples) - floor.astype(np.intp)
-    late, before = (path[np.clip(at, 0, path.size - 1)] for at in (after, after - 1))
-    result: FloatArray = late + (shifts - floor) * (before - late)
-    return result
