@@ -6,11 +6,14 @@ measured when they last ran in full.
 
 import json
 import re
+from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bwbayes import read_record
 from bwbayes.app.commands import cli
 from bwbayes.app.config.settings import SamplingConfig
 from bwbayes.inference.noise import DiscrepancyNoise
@@ -22,7 +25,8 @@ from bwbayes.record.waveforms import Decay, Sine, Waveform
 from bwbayes.sampling import diagnostics
 from tests.app import small
 from tests.examples import README, ROOT, blocks
-from tests.measured import assert_quotes, measured, quotes
+from tests.measured import assert_quotes, keep, measured, quotes
+from tests.test_measured_stack import RECORD
 from tests.test_what_drives_tell import DRIVES, LENGTHS
 
 
@@ -221,3 +225,22 @@ def test_the_methods_state_when_a_sampling_has_converged() -> None:
         f"Each of {prediction.DRAWS:,} draws",
     ):
         assert requirement in METHODS, requirement
+
+
+# Four methods on one measured record: what ``runs/beside_others.py`` finds, and README quotes
+
+
+RUNS = Path(__file__).parents[1] / "runs"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
+def test_the_default_errs_less_on_large_loops_than_three_usual_methods() -> None:
+    """On large loops as were fitted. On a decay and a hold least squares may be better."""
+    compared = run_path(str(RUNS / "beside_others.py"))["compare"](read_record(RECORD))
+    table = compared.table
+    keep("beside others", table)
+    ours = table.pop("bwbayes")
+    for test, factor in {"large loops": 1.0, "decay and hold": 1.5}.items():
+        least = min(row[test]["error_um"] for row in table.values())
+        assert ours[test]["error_um"] < factor * least, test

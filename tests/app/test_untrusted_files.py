@@ -26,7 +26,7 @@ from bwbayes.report.result import Result
 from bwbayes.report.run import priors_table
 from bwbayes.sampling.storage import ChainFile
 from tests.app import example
-from tests.app.mutations import QUICK, good_arrays, stored
+from tests.app.test_hostile_input import QUICK, good_arrays, stored
 from tests.sampling.chains import finish, new
 
 

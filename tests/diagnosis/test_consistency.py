@@ -12,7 +12,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
-from tests.inference.test_joint import joint
+from tests.inference.test_likelihood import joint
 from tests.measured import keep
 
 

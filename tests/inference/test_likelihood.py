@@ -1,11 +1,11 @@
-"""The likelihood of a record whose start is unknown, or whose readings are not all there.
+"""The likelihood of a record, the posterior of a batch of models, and that of several records.
 
 Everything is compared with a dense Gaussian: the covariance of the discrepancy and the sensor at
 the readings' times, with that of the unknown start added, all inverted at once.
 """
 
-from dataclasses import replace
-from typing import Any, cast
+from dataclasses import dataclass, replace
+from typing import Any, cast, get_args
 
 import numpy as np
 import pytest
@@ -13,25 +13,31 @@ from hypothesis import example, given, strategies as st
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
+from bwbayes.inference.outliers import outliers, surprise
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inputs import Hold
+from bwbayes.model.inputs import Hold, Inputs
 from tests.inference.problems import (
     INTERVAL,
     decaying_sine,
     posterior_of,
     ring_bender,
     short_posterior,
+    single,
 )
 
-SLOW = {"mass": 0.00134, "stiffness": 4.1e5}
+RINGING = {"mass": 0.00134, "stiffness": 4.1e5}
 COMPLEX = {"mass": 300.0, "damping": 3000.0, "stiffness": 4.1e5}
 MODELS: list[tuple[str, dict[str, float]]] = [
     ("none", {}),
     ("lag", {}),
-    ("second-order", SLOW),
+    ("second-order", RINGING),
     ("second-order", COMPLEX),
 ]
 
@@ -191,3 +197,250 @@ def test_no_absurd_place_is_more_probable_than_a_possible_one(
     for name, value in absurd.items():
         theta = likelihood.table.replaced(theta, name, np.array([value]))
     assert likelihood.log_density(theta)[0] < np.max(likelihood.log_density(usual))
+
+
+# The posterior of a batch of models; :mod:`tests.test_reference_posteriors` has its numbers
+
+
+@pytest.mark.parametrize("size", [1, 63, 64, 65, 130])
+def test_a_batch_is_its_rows(size: int) -> None:
+    posterior = short_posterior(samples=100, dynamics="lag", fixed={})
+    z = posterior.prior.unconstrain(posterior.prior.draw(np.random.default_rng(2), size))
+    z[0, 0] = 40.0  # one row is outside
+    together = posterior.log_density(z)
+    alone = np.concatenate([posterior.log_density(row[np.newaxis]) for row in z])
+    assert -np.inf == together[0] == alone[0]
+    np.testing.assert_allclose(alone[1:], together[1:], rtol=1e-12)
+
+
+@dataclass(frozen=True)
+class BrokenNoise(WhiteNoise):
+    """A likelihood that fails for every other model."""
+
+    value: float = np.nan
+
+    def whiten(
+        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the white noise's innovations, with a hole in every other determinant."""
+        white, log_determinant = super().whiten(theta, series, skipped)
+        log_determinant[::2] = self.value
+        return white, log_determinant
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_likelihood_that_is_not_finite_is_no_evidence(value: float) -> None:
+    sound = short_posterior("white", 100)
+    broken = sound.altered(noise=BrokenNoise(value=value))
+    z = sound.prior.unconstrain(sound.prior.draw(np.random.default_rng(3), 6))
+    expected = sound.log_density(z)
+    expected[::2] = -np.inf
+    np.testing.assert_array_equal(expected, broken.log_density(z))
+
+
+@pytest.mark.parametrize(
+    "windows",
+    [(slice(20, 50), slice(0, 20)), (slice(0, 30), slice(20, 50))],
+    ids=["order", "apart"],
+)
+def test_windows_must_be_in_order_and_apart(windows: tuple[slice, ...]) -> None:
+    with pytest.raises(InputError, match="in order of time and must not overlap"):
+        short_posterior("white", 50, training=windows)
+
+
+def test_parameters_must_be_those_of_the_model() -> None:
+    sound = short_posterior("white", 50)
+    with pytest.raises(InputError, match=r"^prior: its parameters must be d, .*, in this order"):
+        sound.altered(noise=DiscrepancyNoise(INTERVAL))
+    offset = single("offset", sound.prior.free[-2].prior or pytest.fail("has a prior"))
+    with pytest.raises(InputError, match="in this order"):
+        replace(sound, prior=offset)
+
+
+# Isolated outliers are found, all of them and nothing else, and what is left is as without them
+
+
+def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
+    displacement = posterior.single_record.displacement.copy()
+    displacement[rows] += size * (-1.0) ** np.arange(len(rows))
+    return posterior.altered(displacement=displacement)
+
+
+def test_a_reading_is_set_aside_from_six_sds_on() -> None:
+    """One that is moved to nine sds from what the others predict is, one at four is not."""
+    good = short_posterior(samples=400)
+    place = pointfit.fit(good, np.random.default_rng(9)).mode
+    before, after = (surprise(p, place)[300] for p in (good, spoilt(good, [300], 1.0)))
+    for sds, aside in ((9.0, [300]), (4.0, [])):
+        moved = spoilt(good, [300], (sds - before) / (after - before))
+        assert aside == outliers(moved.without, np.random.default_rng(9))["record"].tolist()
+
+
+def test_what_is_left_is_the_posterior_without_those_readings() -> None:
+    """The same posterior as that of the good record with these readings missing, exactly."""
+    good = short_posterior(samples=600)
+    rows = [40, 41, 300, 599]
+    spiky = spoilt(good, rows)
+    aside = outliers(spiky.without, np.random.default_rng(4))["record"]
+    assert rows == aside.tolist()
+    cleaned, missing = (p.single_record.displacement.copy() for p in (spiky, good))
+    cleaned[aside] = missing[rows] = np.nan
+    z = good.prior.unconstrain(good.prior.draw(np.random.default_rng(5), 5))
+    np.testing.assert_array_equal(
+        spiky.altered(displacement=cleaned).log_density(z),
+        good.altered(displacement=missing).log_density(z),
+    )
+
+
+def test_a_record_full_of_outliers_is_refused() -> None:
+    posterior = short_posterior(samples=400)
+    noisy = spoilt(posterior, list(range(0, 400, 12)), 30.0)
+    with pytest.raises(InputError, match="too many for isolated outliers"):
+        outliers(noisy.without, np.random.default_rng(8))
+
+
+# The posterior of several records: a sum over them, with what is shared there once.
+# It is held against the posteriors of the records alone, and against the whole record where two
+# records are its halves.
+
+
+ENGINES = get_args(Engine)
+
+# The records: samples, periods, amplitude in V, sampling interval in s, and whether from rest.
+RECORDS = {"loops": (240, 4.0, 100.0, INTERVAL, True), "slow": (150, 1.5, 60.0, 0.025, False)}
+
+
+def dataset(name: str, noise: str = "discrepancy", dynamics: str = "lag") -> Likelihood:
+    samples, periods, amplitude, interval, from_rest = RECORDS[name]
+    actuator = Actuator(dynamics, "first", interval)
+    voltage = decaying_sine(samples, periods, amplitude)
+    offset = 3.0 if from_rest else -2.0
+    displacement = offset + ring_bender(actuator, noise, voltage, samples)
+    windows = (slice(0, samples // 2), slice(samples // 2 + 10, samples))
+    model = noise_model(noise, interval)
+    inputs = Inputs(voltage, interval=interval)
+    return Likelihood(inputs, displacement, windows, actuator, model, from_rest, name)
+
+
+def joint(
+    *datasets: Likelihood,
+    per_record: tuple[str, ...] = (),
+    shared: tuple[str, ...] = (),
+    engine: Engine = "numpy",
+) -> Posterior:
+    first = datasets[0]
+    names = tuple(one.name for one in datasets)
+    table = replace(first.table, records=names, per_record=per_record, shared=shared)
+    usual = posterior_of(first.voltage, first.displacement, first.actuator, "discrepancy", {})
+    known = {p.name: p for p in usual.prior.parameters}
+    parameters = []
+    for name, declared, record in table.layout:
+        parameter = known[declared.name]
+        rested = {one.name for one in datasets if one.from_rest}
+        if declared.name == "initial" and rested and (record in rested or not record):
+            parameter = Parameter.of(declared, 0.0)
+        parameters.append(replace(parameter, name=name, record=record))
+    prior = JointPrior(parameters, first.actuator.hysteresis.holds)
+    return Posterior(tuple(datasets), prior, engine, table)
+
+
+def drawn(posterior: Posterior, models: int, seed: int = 1) -> FloatArray:
+    """Return θ (models, parameters) from the prior."""
+    prior = posterior.prior
+    return prior.theta(prior.draw(np.random.default_rng(seed), models))
+
+
+LOOPS, SLOW = dataset("loops"), dataset("slow")
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_likelihood_is_the_sum_of_the_records_likelihoods(engine: Engine) -> None:
+    """Each at its own θ; other intervals, starts, windows and ranges of the voltage."""
+    both = joint(LOOPS, SLOW, engine=engine)
+    theta = drawn(both, 7)
+    expected = np.zeros(7)
+    for one in (LOOPS, SLOW):
+        mine = [
+            name if name in both.table.names else f"{name}[{one.name}]" for name in one.table.names
+        ]
+        columns = [both.table.names.index(name) for name in mine]
+        expected += one.by("numpy").log_density(theta[:, columns])
+    np.testing.assert_allclose(both.log_likelihood(theta), expected, rtol=1e-9)
+
+
+def test_halves_with_a_discrepancy_are_the_whole() -> None:
+    """Means to 0.1 sd and sds to 5%, the halves ten correlation times apart.
+
+    Windows of one record share the discrepancy, too: halves that follow at once on each other lose
+    what it remembers over the cut, 0.15 sd of the offset in 20 s. By point fits, which have no
+    Monte Carlo error; the twin has an offset of its own in each half.
+    """
+    voltage = decaying_sine(2000, 8.0)
+    actuator = Actuator("none", "first", INTERVAL)
+    reading = ring_bender(actuator, "discrepancy", voltage, 3)
+    noise = noise_model("discrepancy", INTERVAL)
+    windows = slice(0, 900), slice(1100, 2000)
+
+    def half(name: str, *training: slice) -> Likelihood:
+        inputs = Inputs(voltage, interval=INTERVAL)
+        return Likelihood(inputs, reading, training, actuator, noise, True, name)
+
+    one = joint(half("whole", *windows))
+    halves = [half(f"half-{i}", window) for i, window in enumerate(windows)]
+    points = {}
+    for shared in (("initial", "offset"), ("initial",)):
+        two = joint(*halves, shared=shared)
+        points[shared] = two, pointfit.fit(two, np.random.default_rng(1))
+    whole = pointfit.fit(one, np.random.default_rng(1))
+    sd = np.sqrt(np.diag(whole.covariance))
+    two, point = points["initial", "offset"]
+    assert one.names == two.names
+    assert np.max(np.abs(point.mode - whole.mode) / sd) < 0.1
+    np.testing.assert_allclose(np.sqrt(np.diag(point.covariance)), sd, rtol=0.05)
+    loose, wrong = points["initial",]
+    place = loose.names.index("offset[half-1]")
+    assert np.sqrt(wrong.covariance[place, place]) > 1.2 * sd[one.names.index("offset")]
+
+
+def test_bounds_hold_in_every_record() -> None:
+    """With alpha of each record its own: 0 < alpha < d, and |gamma| <= beta."""
+    both = joint(LOOPS, SLOW, per_record=("alpha", "gamma"))
+    column = both.table.columns(drawn(both, 200))
+    for record in ("loops", "slow"):
+        assert (column[f"alpha[{record}]"] < column["d"]).all()
+        assert (np.abs(column[f"gamma[{record}]"]) <= column["beta"]).all()
+    free = both.prior.draw(np.random.default_rng(5), 50)
+    back, _ = both.prior.constrain(both.prior.unconstrain(free))
+    np.testing.assert_allclose(back, free, rtol=1e-6, atol=1e-9)
+    # A shared parameter whose bounds hang on the records' own obeys the tightest.
+    tight = joint(LOOPS, SLOW, per_record=("beta",))
+    column = tight.table.columns(drawn(tight, 200))
+    least = np.minimum(column["beta[loops]"], column["beta[slow]"])
+    assert (np.abs(column["gamma"]) <= least).all()
+
+
+def test_outliers_are_found_in_the_record_that_has_them() -> None:
+    loops, slow = (dataset(name, "white", "none") for name in RECORDS)
+    spoilt = slow.displacement.copy()
+    spoilt[40] += 60.0
+    both = joint(loops, replace(slow, displacement=spoilt))
+    aside = outliers(both.without, np.random.default_rng(6))
+    assert {"loops": [], "slow": [40]} == {name: rows.tolist() for name, rows in aside.items()}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"per_record": ("sensor",)}, r"model.per_record: no part here has 'sensor'; did you mean"),
+        ({"shared": ("creep_1",)}, r"model.shared: no part here has 'creep_1'; "),
+        (
+            {"per_record": ("offset",), "shared": ("offset",)},
+            "model.per_record: 'offset' is in model.shared too; remove it from one of them",
+        ),
+    ],
+)
+def test_scopes_of_parameters_that_there_are_not_are_refused(
+    given: dict[str, tuple[str, ...]], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        joint(LOOPS, SLOW, **given)  # type: ignore[arg-type]

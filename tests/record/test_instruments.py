@@ -1,14 +1,17 @@
 """Every form in which a bench writes a record is read, with as little said as possible."""
 
+import math
 import warnings
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import example, given, strategies as st
+from hypothesis import assume, example, given, strategies as st
+from openpyxl import Workbook
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
@@ -178,3 +181,197 @@ def test_a_rate_above_the_header_is_asked_for_unless_the_length_beside_it_is_rig
         with pytest.raises(ColumnsError, match="sampling rate") as caught:
             read(written)
         assert ({}, 200.0) == (caught.value.guess["units"], caught.value.fs)
+
+
+# Of several tables in one file one is read, the one that is chosen; of cells what they hold
+
+
+HEADERS = ("time_s,voltage_V,displacement_um", "t [s],U [V],x [um]", "Time,Drive,Pos\ns,V,um")
+Cells = list[tuple[float, float, float]]
+
+
+def tables(lengths: list[int]) -> list[Cells]:
+    """Return so many rows of the record, from its start on in each table but other voltages."""
+    return [
+        [
+            (float(t), float(scale * v), float(d))
+            for t, v, d in zip(TIME[:n], VOLTAGE, DISPLACEMENT, strict=False)
+        ]
+        for scale, n in enumerate(lengths, start=1)
+    ]
+
+
+def written(path: Path, headers: list[str], titles: list[str], content: list[Cells]) -> None:
+    lines = []
+    for header, title, rows in zip(headers, titles, content, strict=True):
+        lines += [title, header, *(",".join(map(repr, row)) for row in rows), ""]
+    path.write_text("\n".join(lines))
+
+
+def assert_holds(path: Path, table: Any, rows: Cells) -> None:
+    record = read_record(path, table=table)
+    assert record.displacement is not None
+    _, voltage, displacement = np.array(rows).T
+    np.testing.assert_allclose(record.voltage, voltage, rtol=1e-15)
+    np.testing.assert_allclose(record.displacement, displacement, rtol=1e-15)
+
+
+@quiet
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(HEADERS),
+            st.sampled_from(["", "Run 7", "3.3.2026 12:00", "Sample Interval,0.005", "# new run"]),
+            st.integers(12, 40),
+        ),
+        min_size=2,
+        max_size=4,
+    ),
+    st.data(),
+)
+def test_a_table_of_a_text_is_read_as_if_it_stood_alone(
+    folder: Path, blocks: list[tuple[str, str, int]], data: st.DataObject
+) -> None:
+    headers, titles, lengths = ([block[i] for block in blocks] for i in range(3))
+    path = folder / "tables.csv"
+    content = tables(lengths)  # type: ignore[arg-type]
+    written(path, headers, titles, content)  # type: ignore[arg-type]
+    number = data.draw(st.integers(1, len(blocks)))
+    assert_holds(path, data.draw(st.sampled_from([number, str(number)])), content[number - 1])
+    with pytest.raises(InputError, match=rf"{len(blocks)} tables with numbers: 1 .*, as `table=1`"):
+        read_record(path)
+    for wrong in (0, len(blocks) + 1, "Run 8"):
+        with pytest.raises(InputError, match=f"no table {wrong!r}; choose from 1 "):
+            read_record(path, table=wrong)
+
+
+@quiet
+@given(
+    st.lists(st.integers(12, 40), min_size=2, max_size=4),
+    st.sampled_from([*HEADERS[:2], ""]),
+    st.sampled_from(["", "\n"]),
+    st.sampled_from([",", "\t", ";"]),
+    st.data(),
+)
+def test_a_block_below_an_empty_line_in_which_times_begin_again_is_a_table(
+    folder: Path, lengths: list[int], header: str, between: str, separator: str, data: st.DataObject
+) -> None:
+    content = tables(lengths)
+    blocks = ["\n".join(separator.join(map(repr, row)) for row in rows) for rows in content]
+    path = folder / "blocks.csv"
+    header = header.replace(",", separator)
+    path.write_text(f"{header}\n{f'\n{between}\n'.join(blocks)}\n")
+    number = data.draw(st.integers(1, len(blocks)))
+    naming: dict[str, Any] = {
+        "columns": {"time": 1, "voltage": 2, "displacement": 3},
+        "units": {"time": "s", "voltage": "V", "displacement": "um"},
+    }
+    record = read_record(path, table=number, **({} if header else naming))
+    np.testing.assert_allclose(record.voltage, np.array(content[number - 1])[:, 1], rtol=1e-15)
+    listed = ", ".join(rf"{i} '.*' \({n} rows.*\)" for i, n in enumerate(lengths, start=1))
+    with pytest.raises(InputError, match=f"tables with numbers: {listed}; choose one"):
+        read_record(path)
+
+
+@quiet
+@pytest.mark.parametrize("between", ["", "# paused", HEADERS[0], "\n\n"])
+def test_a_table_goes_on_after_a_pause(tmp_path: Path, between: str) -> None:
+    """With the header once more, an empty line or a comment, and alone it has number 1."""
+    (rows,) = tables([60])
+    lines = [",".join(map(repr, row)) for row in rows]
+    text = "\n".join([HEADERS[0], *lines[:30], between, *lines[30:], ""])
+    (tmp_path / "a.csv").write_text(text)
+    for table in (None, 1, "1"):
+        assert_holds(tmp_path / "a.csv", table, rows)
+
+
+@quiet
+def test_an_error_in_a_table_names_the_line_of_the_file(tmp_path: Path) -> None:
+    written(tmp_path / "a.csv", [HEADERS[0]] * 2, ["one", "two"], tables([20, 20]))
+    lines = (tmp_path / "a.csv").read_text().split("\n")
+    lines[30] = "0.03,what,1.0"
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"a\.csv:31: voltage_V: 'what'"):
+        read_record(tmp_path / "a.csv", table="two")
+
+
+@quiet
+def test_a_sheet_is_chosen_by_number_or_name_among_those_with_numbers(tmp_path: Path) -> None:
+    from openpyxl import Workbook  # noqa: PLC0415  # an extra
+
+    book, content = Workbook(), tables([20, 30, 40])
+    book.active.title = "Notes"
+    book.active.append(["bench", 3])
+    for title, rows in zip(("up", "2", "down"), content, strict=True):
+        sheet = book.create_sheet(title)
+        for row in (["t [s]", "U [V]", "x [um]"], *rows):
+            sheet.append(row)
+    path = tmp_path / "a.xlsx"
+    book.save(path)
+    for table, rows in zip((1, "2", "down", 3), [*content, content[2]], strict=True):
+        assert_holds(path, table, rows)
+    with pytest.raises(InputError, match=r"3 tables with numbers: 1 'up', 2 '2', 3 'down'; choose"):
+        read_record(path)
+    with pytest.raises(InputError, match="no table 'Note'; choose from 1 'up'"):
+        read_record(path, table="Note")
+
+
+EPOCH = datetime(1899, 12, 30)  # cells have no zone
+FORMATS = {
+    "duration": "[h]:mm:ss.000",
+    "time of day": "hh:mm:ss.0",
+    "date": "yyyy-mm-dd hh:mm:ss",
+    "minutes": "[mm]:ss",
+}
+
+
+@given(
+    st.sampled_from([*FORMATS]),
+    st.sampled_from([1e-5, 2e-5, 1e-4, 4e-4, 5e-3, 0.25]),
+    st.floats(0, 0.9).map(lambda days: round(days, 5)),
+    st.booleans(),
+)
+@example("duration", 0.25, 0.99999, False)  # beyond a day
+@example("date", 1e-5, 0.0, True)
+def test_times_are_as_fine_as_their_numbers_however_they_are_shown(
+    folder: Path, shown: str, dt: float, start: float, by_python: bool
+) -> None:
+    """As 15 digits of days, or as openpyxl writes Python's times; both far below 1 ms."""
+    # Of a date 15 digits of days are 9 us.
+    assume(by_python or shown != "date" or dt > 2e-5)
+    book = Workbook()
+    book.active.append(["Time", "U [V]", "x [um]"])
+    whole_days = 46_084 if shown == "date" else 0
+    for i, (v, d) in enumerate(zip(VOLTAGE[:60], DISPLACEMENT[:60], strict=True)):
+        delta = timedelta(days=whole_days + start, seconds=i * dt)
+        days = float(f"{whole_days + start + i * dt / 86400:.15g}")
+        value = (EPOCH + delta if shown == "date" else delta) if by_python else days
+        book.active.append([value, v, d])
+        book.active.cell(i + 2, 1).number_format = FORMATS[shown]
+    path = folder / "times.xlsx"
+    book.save(path)
+    record = read_record(path)
+    assert record.interval == pytest.approx(dt, rel=1e-9)
+    np.testing.assert_allclose(record.voltage, VOLTAGE[:60], rtol=1e-12)
+    since = (datetime(1970, 1, 1) - EPOCH) / timedelta(seconds=1)
+    expected = (whole_days + start) * 86400 - (since if shown == "date" else 0)
+    assert math.isclose(record.start + record.time_offset, expected, rel_tol=0, abs_tol=2e-5)
+
+
+def test_a_workbook_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = INSTRUMENTS["pandas to Excel, with dates"](tmp_path).path
+    monkeypatch.setitem(__import__("sys").modules, "openpyxl", None)
+    with pytest.raises(InputError, match=r"a\.xlsx: .* openpyxl; pip install 'bwbayes\[xlsx\]'"):
+        read_record(path)
+
+
+def test_a_workbook_without_numbers_or_that_is_cut_off_is_refused_in_a_line(tmp_path: Path) -> None:
+    book = Workbook()
+    book.active.append(["nothing", "here"])
+    book.save(tmp_path / "a.xlsx")
+    with pytest.raises(InputError, match="no sheet has columns of numbers"):
+        read_record(tmp_path / "a.xlsx")
+    content = INSTRUMENTS["pandas to Excel, with dates"](tmp_path).path.read_bytes()
+    (tmp_path / "a.xlsx").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="damaged or cut off"):
+        read_record(tmp_path / "a.xlsx")
