@@ -9,6 +9,7 @@ the answer itself. The modes of a long record are looked for in a thinned one, o
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -59,11 +60,15 @@ class MAPEstimate:
 
 
 def fit(
-    posterior: Posterior, generator: np.random.Generator, watch: Watch = unwatched
+    posterior: Posterior,
+    generator: np.random.Generator,
+    watch: Watch = unwatched,
+    further: Iterable[FloatArray] = (),
 ) -> MAPEstimate:
     """Find the mode of a posterior and the Gaussian approximation there.
 
-    ``watch`` is called with the share that is done.
+    ``further`` places (free,) are climbed from as well. ``watch`` is called with the share that is
+    done.
 
     Raises
     ------
@@ -90,6 +95,8 @@ def fit(
             places = _unthinned(posterior, thinned, point, generator)
         for start_point in watched(places, part(watch, 0.5, 1.0)):
             _add_mode(posterior, modes, start_point)
+    for start_point in further:
+        _add_mode(posterior, modes, start_point)
     watch(1.0)
     return _estimate(modes, spread)
 

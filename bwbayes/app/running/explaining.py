@@ -97,10 +97,7 @@ def chosen_noise(study: Study, point: MAPEstimate, watch: Watch = unwatched) -> 
     for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
         spec = replace(study.spec, noise=_beside(noise, sensor))
         other = study.with_model(spec).posterior
-        # Parameters that only the other noise has start at their priors' medians.
-        named = dict(zip(posterior.names, point.optima.T, strict=True))
-        nothing = np.zeros(len(point.optima))
-        places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
+        places = _optima_by_name(posterior, point, other)
         fits = [
             climb(
                 other.for_record(name),
@@ -127,6 +124,16 @@ def chosen_noise(study: Study, point: MAPEstimate, watch: Watch = unwatched) -> 
     why = ", ".join(against) or "with no other does the model follow the readings"
     chosen = _beside(best, sensor)
     return chosen, f"noise: {chosen} ({why})"
+
+
+def _optima_by_name(posterior: Posterior, point: MAPEstimate, other: Posterior) -> FloatArray:
+    """Return places (optima, free) of another posterior at the optima of a posterior.
+
+    Parameters that only the other one has are at their priors' medians.
+    """
+    named = dict(zip(posterior.names, point.optima.T, strict=True))
+    nothing = np.zeros(len(point.optima))
+    return np.stack([named.get(name, nothing) for name in other.names], axis=1)
 
 
 def _beside(noise: str, sensor: Sequence[str]) -> str:
@@ -160,13 +167,17 @@ def choose_model(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
     noise, why = chosen_noise(run.study, point, partial(watch, "noise model"))
     chosen = with_model(run, replace(run.study.spec, noise=noise), noise=noise)
     if chosen.study is not run.study:
-        point = _fit_point(chosen.study, partial(watch, f"MAP estimate, {noise} noise"))
+        # A long record's noise has further modes, and its beginning may show one that is not the
+        # best: here is the one that the noise was chosen for.
+        places = _optima_by_name(run.study.posterior, point, chosen.study.posterior)
+        step = partial(watch, f"MAP estimate, {noise} noise")
+        point = _fit_point(chosen.study, step, places)
         explanations = None
     return ChosenModel(chosen, point, (*searched.steps, why), explanations)
 
 
-def _fit_point(study: Study, watch: Watch) -> MAPEstimate:
-    return map_estimate.fit(study.posterior, study.generator("point fit"), watch)
+def _fit_point(study: Study, watch: Watch, further: Iterable[FloatArray] = ()) -> MAPEstimate:
+    return map_estimate.fit(study.posterior, study.generator("point fit"), watch, further)
 
 
 def search_stages(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
