@@ -293,11 +293,11 @@ def test_nothing_but_a_dataclass_of_the_package_comes_out_of_a_file(
     assert {"bands": 1.0} == fingerprint_module.load(path, "now")
     assert fingerprint_module.load(path, "then") is None
     text = '{"state": "now", "values": {"class": "' + kind + '", "fields": []}}'
-    stage_content = BytesIO()
-    np.savez(stage_content, text=np.array(text))
-    path.write_bytes(stage_content.getvalue())
+    archive = BytesIO()
+    np.savez(archive, text=np.array(text))
+    path.write_bytes(archive.getvalue())
     assert fingerprint_module.load(path, "now") is None
-    path.write_bytes(sha256(stage_content.getvalue()).digest() + stage_content.getvalue())
+    path.write_bytes(sha256(archive.getvalue()).digest() + archive.getvalue())
     with pytest.raises(ValueError, match=f"{kind} is no"):
         fingerprint_module.load(path, "now")
 
