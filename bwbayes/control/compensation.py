@@ -21,10 +21,11 @@ with a jump, of 10 V for an offset of 7 um.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -72,6 +73,7 @@ class _Plan:
     hold: Hold
     seed: int
     instruments: Instruments
+    conditions: Mapping[str, float]
 
     @property
     def references(self) -> FloatArray:
@@ -84,7 +86,8 @@ class _Plan:
 
     def record(self, voltage: FloatArray) -> Record:
         """Return a command as a record."""
-        record = planned(voltage, self.reference, self.hold, self.reference.name)
+        name = self.reference.name
+        record = planned(voltage, self.reference, self.hold, name, self.conditions)
         return replace(record, instruments=self.instruments)
 
     def initial_states(self, voltage: FloatArray) -> InitialStates:
@@ -154,6 +157,7 @@ def compensate(
     nearest: bool = False,
     limit: float | None = None,
     instruments: Instruments = EXACT,
+    conditions: Mapping[str, float] = MappingProxyType({}),
     watch: Watch = unwatched,
 ) -> Compensation:
     """Return the command for a reference, and what is promised of it.
@@ -170,7 +174,8 @@ def compensate(
     ``limits`` and ``nearest`` are as of :func:`~bwbayes.model.inverse.inverse`; not from rest, the
     actuator has waited at zero volts until it stood still, in a state of its hysteresis that
     nothing tells. ``limit`` is that of the tracking error, um; the ``instruments`` are those that
-    read the record that was fitted. ``watch`` is called with the share that is done.
+    read the record that was fitted, ``conditions`` the covariates, which stay as they are.
+    ``watch`` is called with the share that is done.
 
     Raises InputError: a reference that cannot be reached, with its place and time; an amplifier
     without zero volts; a limit that is not positive.
@@ -197,13 +202,14 @@ def compensate(
         hold,
         seed,
         instruments,
+        conditions,
     )
     requested, target = plan.references
     record = posterior.single_record
     slope, _ = np.polyfit(record.voltage[record.readings.rows], record.readings.values, 1)
     linear = np.clip(requested / slope, limits.low, limits.high)
     states = plan.initial_states(linear)
-    actuator = states.histories.likelihoods[-1].actuator
+    actuator = replace(states.histories.likelihoods[-1].actuator, conditions=conditions)
     model = states.model.mean(axis=0)
     # The mean model's own place at zero volts, where all begin, is not the mean of the places.
     at_zero = actuator.displacement(model, [0.0], from_rest=from_rest)[0, 0]
@@ -240,8 +246,9 @@ def compensate(
         )
     straight = plan.played(linear, part(watch, 0.5, 1.0))
     return Compensation(
-        reference, command, played, straight, hold, between, from_rest, limits, limit, tuple(notes)
-    )
+        reference, command, played, straight, hold, between, from_rest, limits, limit, tuple(notes),
+        conditions=dict(conditions),
+    )  # fmt: skip
 
 
 def _between(actuator: Actuator, model: FloatArray, voltage: FloatArray, from_rest: bool) -> float:
@@ -352,7 +359,8 @@ class Compensation(Product):
     was taken; ``compensated`` is that command, ``linear`` the one without compensation. ``limit``
     is that of the error, um, if there is one; ``limits`` are the amplifier's; ``hold`` is what the
     command does between samples, and ``between`` how far the displacement leaves straight lines
-    there, um. ``standing`` is how the validation of the run came out that all of this builds on.
+    there, um. ``conditions`` are the covariates, and ``standing`` is how the validation of the run
+    came out that all of this builds on.
     """
 
     NAME: ClassVar[str] = "compensation"
@@ -368,6 +376,7 @@ class Compensation(Product):
     limit: float | None = None
     remarks: tuple[str, ...] = ()
     standing: ValidationSummary = field(default_factory=ValidationSummary)
+    conditions: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def asked(self) -> FloatArray:
@@ -422,9 +431,8 @@ class Compensation(Product):
     @property
     def record(self) -> Record:
         """The command as a record that a signal generator can play."""
-        return planned(
-            self.voltage, self.reference, self.hold, f"command for {self.reference.name}"
-        )
+        name = f"command for {self.reference.name}"
+        return planned(self.voltage, self.reference, self.hold, name, self.conditions)
 
     def records(self) -> dict[str, Record]:
         """Return the command by the name of its file."""
@@ -450,6 +458,7 @@ class Compensation(Product):
             "between_samples_um": self.between,
             "command": self.command,
             **self.limits.numbers,
+            "conditions": dict(self.conditions),
             "fastest_V_per_s": self.fastest,
             "limit_um": self.limit,
             "limit_kept": self.limit_kept,
@@ -512,7 +521,7 @@ class Compensation(Product):
             heading=f"Compensation: {name}",
             banners=[*standing_banner(self.standing), promise, *remarks_banner(self.remarks)],
             blocks=[
-                Facts([("Amplifier", f"{self.limits}; {fastest}")]),
+                Facts([("Amplifier", f"{self.limits}; {fastest}"), *facts_of(self.conditions)]),
                 self._table(),
                 Picture(
                     "tracking",
@@ -617,12 +626,24 @@ def _span(edges: Sequence[float]) -> str:
     return f"{edges[0]:.4g} to {edges[1]:.4g}"
 
 
-def planned(voltage: FloatArray, reference: Reference, hold: Hold, origin: str) -> Record:
+def facts_of(conditions: Mapping[str, float]) -> list[tuple[str, str]]:
+    """Return a page's facts on the covariates of a command or model."""
+    return [(name, f"{value:.6g}, constant") for name, value in conditions.items()]
+
+
+def planned(
+    voltage: FloatArray,
+    reference: Reference,
+    hold: Hold,
+    origin: str,
+    conditions: Mapping[str, float],
+) -> Record:
     """Return a command as a record, whose voltage is what it is for this hold."""
     return Record(
         voltage,
         None,
         interval=reference.interval,
+        covariates={name: np.full(voltage.size, value) for name, value in conditions.items()},
         voltage_is="command" if hold == "zero" else "output",
         origin=origin,
     )

@@ -32,6 +32,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from bwbayes.arrays import FloatArray
+from bwbayes.control.compensation import facts_of
 from bwbayes.control.sampled import (
     SampledModel,
     SampledStage,
@@ -333,6 +334,7 @@ class Exported(Product):
         """Return the parts, for a page: the files are all there is to see on a screen."""
         facts = [(name, str(value)) for name, value in self.numbers()["parts"].items()]
         facts += [("limits of the inverse", str(self.limits))]
+        facts += facts_of(self.model.actuator.conditions)
         return Report(title=self.name, blocks=[Facts(facts)])
 
     def save(
@@ -373,6 +375,7 @@ class Exported(Product):
             "interval_s": actuator.interval,
             "hold": actuator.hold,
             **self.limits.numbers,
+            "conditions": dict(actuator.conditions),
             "inverse": self.without_inverse is None,
             "without_inverse": self.without_inverse,
             "instruments": self.instruments.facts,

@@ -32,7 +32,7 @@ from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import Span
 from bwbayes.model.linear import Taps
 from bwbayes.model.operator import HysteresisStep
-from bwbayes.model.stage import Stage, Timing
+from bwbayes.model.stage import Stage
 from bwbayes.prediction.loops import steady_loop
 from bwbayes.shown import brief
 
@@ -143,12 +143,12 @@ class SampledStage(NamedTuple):
 
     @classmethod
     def row(
-        cls, stages: Sequence[Stage], column: Values, timing: Timing, at_rest: FloatArray
+        cls, stages: Sequence[Stage], actuator: Actuator, column: Values, at_rest: FloatArray
     ) -> tuple[tuple[SampledStage, ...], FloatArray]:
         """Return stages in a row, and what comes out behind them at rest at zero volts."""
-        row = []
+        row, inputs = [], actuator.along(np.zeros(1))
         for stage in stages:
-            numbers = stage.numbers(column, timing)
+            numbers = stage.numbers_at(column, actuator.timing, inputs)
             row.append(cls(stage, numbers.T, at_rest))
             at_rest, _ = stage.settled(numbers, at_rest)
         return tuple(row), at_rest
@@ -193,7 +193,7 @@ class SampledModel:
         column = {name: values.copy() for name, values in actuator.columns(theta).items()}
         actuator = actuator.without_events
         for stage in actuator.stages:
-            if stage.sees:
+            if not actuator.fixes(stage):
                 raise InputError(
                     f"stages: {stage.name} follows {' and '.join(stage.sees)}, which a model of "
                     "one sample at a time does not see; fit without it"
@@ -236,14 +236,14 @@ class SampledModel:
     @cached_property
     def inputs(self) -> tuple[tuple[SampledStage, ...], FloatArray]:
         """The stages before the hysteresis, and the voltage behind them at rest, (models,), V."""
-        actuator, zero = self.actuator, np.zeros(self.models)
-        return SampledStage.row(actuator.inputs, self.column, actuator.timing, zero)
+        zero = np.zeros(self.models)
+        return SampledStage.row(self.actuator.inputs, self.actuator, self.column, zero)
 
     @cached_property
     def outputs(self) -> tuple[tuple[SampledStage, ...], FloatArray]:
         """The stages behind the dynamics, and what comes out of them at rest, (models,), um."""
-        actuator, level = self.actuator, self._settle(self.inputs[1])[2]
-        return SampledStage.row(actuator.outputs, self.column, actuator.timing, level)
+        level = self._settle(self.inputs[1])[2]
+        return SampledStage.row(self.actuator.outputs, self.actuator, self.column, level)
 
     def _settle(self, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Let hysteresis, dynamics and creep come to rest at a voltage (models,), V.
@@ -340,7 +340,8 @@ class SampledModel:
         """
         loop = steady_loop(self.actuator, self.column, *limits, points=3)
         # At rest nothing of the sections but the drive counts, and without creep.
-        at_zero = self._settle(self.inputs[1])[1][0, 0]
+        drive, behind = self._settle(self.inputs[1])[1][0], self.actuator.static.outputs
+        at_zero = SampledStage.row(behind, self.actuator, self.column, drive)[1][0]
         return Span(float(loop.falling[0, 0] - at_zero), float(loop.rising[0, -1] - at_zero))
 
     def frequency_response(self, angles: FloatArray) -> FloatArray:

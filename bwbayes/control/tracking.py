@@ -10,7 +10,7 @@ All begin demagnetized at zero volts, and 0 um of a reference is where the actua
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.control.compensation import facts_of
 from bwbayes.control.loop import (
     CONTROLLERS,
     Gains,
@@ -61,7 +62,8 @@ class Tracking(Product):
     (controllers, frequencies, signals, draws), in the order of ``CONTROLLERS``, ``frequencies``,
     Hz, and ``signals``. The references swing by ``amplitude`` about the ``middle``, um; their jumps
     take the time ``rise``, s. ``standing`` is how the validation of the run came out that gave the
-    draws, ``name`` what it is called, and ``instruments`` those that it was fitted with.
+    draws, ``name`` what it is called, ``instruments`` those that it was fitted with, and
+    ``conditions`` the covariates.
     """
 
     NAME: ClassVar[str] = "track"
@@ -82,6 +84,7 @@ class Tracking(Product):
     standing: ValidationSummary = field(default_factory=ValidationSummary)
     name: str = ""
     instruments: Instruments = EXACT
+    conditions: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def best(self) -> FloatArray:
@@ -151,6 +154,7 @@ class Tracking(Product):
                 "rise_s": self.rise,
                 **self.stand.allowed.numbers,
             },
+            "conditions": dict(self.conditions),
             "draws": int(self.rms.shape[-1]),
             "best_share": [
                 {"signal": signal, "frequency_Hz": frequency, "share": float(self.best[at])}
@@ -189,7 +193,7 @@ class Tracking(Product):
                 self._comparison(),
             ],
             blocks=[
-                Facts([("amplifier", str(self.stand.allowed))]),
+                Facts([("amplifier", str(self.stand.allowed)), *facts_of(self.conditions)]),
                 picture,
                 Section("Errors", [self._errors()], folded=False),
                 Section("The controller", [self._gains()], folded=False),
@@ -346,7 +350,7 @@ def track(
     rms, largest, limited = (np.stack(values, axis=1) for values in zip(*errors, strict=True))
     return Tracking(
         gains, margins, robustness, stand, frequencies, signals, center, amplitude,
-        rise * actuator.interval, rms, largest, limited,
+        rise * actuator.interval, rms, largest, limited, conditions=actuator.conditions,
     )  # fmt: skip
 
 

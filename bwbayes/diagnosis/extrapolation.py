@@ -19,7 +19,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.inputs import RETURN, Inputs, fastest, time_between_turns, turning_points
+from bwbayes.model.inputs import RETURN, Inputs, Span, fastest, time_between_turns, turning_points
 from bwbayes.shown import rounded
 
 # Part of the time between turning points over which a speed is averaged: a sine's peak speed is
@@ -160,8 +160,7 @@ def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator
     stages = posterior.datasets[0].actuator.stages
     seen_names = {name for stage in stages for name in stage.sees}
     for name in sorted(seen_names & {*inputs.covariates}):
-        ranges = [data.inputs.range_of(name, data.training) for data in posterior.datasets]
-        low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+        low, high = covariate_range(posterior, name)
         smallest, largest = inputs.range_of(name, [window])
         slack = 0.02 * (high - low)
         if smallest < low - slack or largest > high + slack:
@@ -170,6 +169,12 @@ def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator
                 f"{low:.4g} to {high:.4g}; the bands extrapolate, their level untested"
             )
             yield Finding("covariate", text, "train on a record that spans this range")
+
+
+def covariate_range(posterior: Posterior, name: str) -> Span:
+    """Return the least and the largest value of a covariate that were fitted."""
+    ranges = [data.inputs.range_of(name, data.training) for data in posterior.datasets]
+    return Span(min(low for low, _ in ranges), max(high for _, high in ranges))
 
 
 def _fitted_range(posterior: Posterior) -> tuple[float, float]:

@@ -97,6 +97,8 @@ class Actuator:
     demagnetized
         The voltage came to a record's first one straight from 0 V, where the actuator was
         demagnetized; dynamics and creep may still be moving.
+    conditions
+        Covariates that do not change along a voltage that comes alone, by name.
 
     Raises
     ------
@@ -115,6 +117,7 @@ class Actuator:
     span: Span | None = None
     stages: tuple[Stage, ...] = ()
     demagnetized: bool = False
+    conditions: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         build_part("dynamics", self.dynamics, DYNAMICS, {}, Filter)
@@ -200,7 +203,7 @@ class Actuator:
             )
         if not isinstance(inputs, Inputs):
             voltage = np.asarray(inputs, dtype=np.float64)
-            inputs = Inputs(voltage, interval=self.interval)
+            inputs = self.along(voltage)
         path = inputs.voltage
         if path.ndim != 1 or path.size == 0:
             raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
@@ -263,6 +266,17 @@ class Actuator:
         result += level[:, np.newaxis]
         return result, equilibrium, filtered
 
+    def along(self, voltage: FloatArray) -> Inputs:
+        """Return a voltage (samples,), V, with the conditions."""
+        covariates = {
+            name: np.full(voltage.shape, value) for name, value in self.conditions.items()
+        }
+        return Inputs(voltage, interval=self.interval, covariates=covariates)
+
+    def fixes(self, stage: Stage) -> bool:
+        """Tell whether all that a stage sees are conditions."""
+        return {*stage.sees} <= {*self.conditions}
+
     @cached_property
     def linear(self) -> Actuator:
         """Dynamics and creep alone: what follows the drive without further stages."""
@@ -271,7 +285,7 @@ class Actuator:
     @property
     def static(self) -> Actuator:
         """The same, as far as only the path of the voltage counts, not its pace."""
-        stages = tuple(stage for stage in self.stages if stage.rate_independent)
+        stages = tuple(s for s in self.stages if s.rate_independent or (s.sees and self.fixes(s)))
         return replace(self, dynamics="none", hold="first", creep=None, stages=stages)
 
     @property

@@ -100,7 +100,7 @@ def inverse(
     for row, samples in enumerate(target):
         column = {name: values[row : row + 1] for name, values in columns.items()}
         single = _Single(actuator, column, from_rest)
-        inputs = Inputs(np.zeros(samples.size), interval=actuator.interval)
+        inputs = actuator.along(np.zeros(samples.size))
         result[row] = single.voltage(samples, inputs, limits or Limits(), nearest)
         # A stage that sees the command is undone with that of the pass before, in 40 at most.
         follows = [stage.name for stage in actuator.stages if "voltage" in stage.sees]

@@ -24,16 +24,22 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
+from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import Inputs, Limits
+from bwbayes.model.stages.covariates import Temperature, TemperatureOffset
 from bwbayes.model.stages.gain import MovingGain
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record import Record, write_record
 from bwbayes.record.io.binary import record_arrays
 from bwbayes.sampling.chain import draws
 from tests.app import small
+from tests.control import cases
+from tests.control.compiled import Compiled
+from tests.programs import needs
 from tests.record.drives import drive
 
 pytestmark = pytest.mark.usefixtures("_without_pictures")
@@ -148,6 +154,59 @@ def test_what_does_not_know_the_temperature_refuses_in_one_line(
     with pytest.raises(bw.InputError, match=r"temperature_degC.*; ") as refused:
         ask(fit)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
+def test_a_command_for_a_temperature_leads_the_plant_there_at_that_temperature(
+    fit: Any, tmp_path: Path
+) -> None:
+    """Within the readings' noise of 0.1 um; at another temperature it does not."""
+    at = {"temperature_degC": 28.0}
+    shape = {"amplitude": 20.0, "frequency": 0.5, "hold": "foh", "from_rest": True}
+    made = fit.compensate("sine", at=at, **shape)
+    assert made.summary["conditions"] == at
+    command = bw.read_record(made.save(tmp_path)[0], need_displacement=False)
+    errors = [
+        float(np.sqrt(np.mean((plant(command.voltage, other, 7, WIDER) - 3.0 - made.asked) ** 2)))
+        for other in (np.full(command.samples, 28.0), np.full(command.samples, 15.0))
+    ]
+    assert errors[0] < 0.11
+    assert errors[1] > 0.25
+    with pytest.raises(bw.InputError, match=r"at: temperature_degC 40 is beyond the 15 to 30 that"):
+        fit.compensate("sine", at={"temperature_degC": "40"}, **shape)
+    fit.compensate("sine", at={"temperature_degC": "40"}, beyond_training=True, **shape)
+    with pytest.raises(bw.InputError, match="temperature-width follows voltage and temperature"):
+        fit.export(at=at)
+
+
+@pytest.mark.parametrize(
+    ("at", "said"),
+    [
+        ({"temperature_degC": "warm"}, "at: temperature_degC is not a finite number; give one"),
+        ({"temperature_degC": 20, "load_N": 3}, "at: the model does not follow load_N; leave it"),
+    ],
+)
+def test_conditions_that_cannot_be_are_refused(fit: Any, at: Any, said: str) -> None:
+    with pytest.raises(bw.InputError, match=said):
+        fit.track(at=at)
+
+
+def test_a_model_at_a_temperature_is_exported(tmp_path: Path) -> None:
+    """The C file is the simulation along a record of that temperature, from where it rests."""
+    stages, conditions = (Temperature(), TemperatureOffset()), {"temperature_degC": 31.0}
+    plain = replace(cases.actuator("bouc-wen, second-order", "zero"), stages=stages)
+    voltage, theta = cases.drive(500), cases.theta(plain)
+    made = exported("bender", replace(plain, conditions=conditions), theta[0], Limits(*cases.SPAN))
+    compiled = Compiled(made, tmp_path, needs("cc"))
+    assert "It is the model at temperature_degC = 31.0." in made.c_code()
+    seen = {"temperature_degC": np.full(voltage.size + 1, 31.0)}
+    # From rest at zero volts, and there 0 um.
+    inputs = Inputs(np.append(0.0, voltage), interval=plain.interval, covariates=seen)
+    moved = plain.displacement(theta, inputs, from_rest=True)[0]
+    displacement = compiled.run("forward", 0.0, inputs.voltage)
+    np.testing.assert_allclose(displacement, moved - moved[0], rtol=0, atol=1e-12 * np.ptp(moved))
+    command = compiled.run("inverse", 0.0, displacement[1:])
+    np.testing.assert_allclose(command, inputs.voltage[: command.size], rtol=0, atol=1e-8)
 
 
 @pytest.mark.usefixtures("_without_explanations")

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.jobs.fit_methods import amplifier_limits
+from bwbayes.app.jobs.fit_methods import amplifier_limits, conditions_at
 from bwbayes.app.study.from_config import open_like
 from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import Compensation, compensate as compensated
@@ -56,6 +56,7 @@ def compensate(
     slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
+    at: Mapping[str, str | float] | None = None,
     beyond_training: bool = False,
     nearest: bool = False,
     reading: Mapping[str, Any] | None = None,
@@ -109,8 +110,10 @@ def compensate(
         Its largest current, A; with the capacitance.
     capacitance
         The actuator's capacitance, F.
+    at
+        Constant value of a covariate that the model follows, as temperature_degC=25.
     beyond_training
-        Allows voltages beyond those that were fitted, where nothing is known of the error.
+        Allows voltages and covariates beyond those fitted, where nothing is known of the error.
     nearest
         If limits are exceeded, return the nearest feasible command.
     reading
@@ -156,6 +159,7 @@ def compensate(
         limits=limits,
         nearest=nearest,
         limit=limit,
+        conditions=conditions_at(study, at, beyond_training=beyond_training),
         instruments=study.record.instruments,
     )
     draws, source = thin_draws(alone.draws, study.generator("draws")), f"compensate {desired.name}"
@@ -252,6 +256,7 @@ def export(
     slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
+    at: Mapping[str, str | float] | None = None,
     beyond_training: bool = False,
     rate: float | None = None,
     hold: str = "zoh",
@@ -280,8 +285,10 @@ def export(
         The amplifier's largest current, A, which limits that change; with the capacitance.
     capacitance
         The actuator's capacitance, F.
+    at
+        Constant value of a covariate that the model follows, as temperature_degC=25.
     beyond_training
-        Allows voltages beyond those that were fitted, where nothing is known of the error.
+        Allows voltages and covariates beyond those fitted, where nothing is known of the error.
     rate
         The controller's samples a second; default: the record's.
     hold
@@ -316,7 +323,8 @@ def export(
         return dataset.table.actuator(theta)
 
     read = fit.flat_draws
-    actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
+    conditions = conditions_at(study, at, beyond_training=beyond_training)
+    actuator = at_rate(dataset.actuator, rate, parse_hold(hold), conditions)
     true_sds = of_actuator(study.true_draws(read)).std(axis=0)
     sds = dict(zip(actuator.parameters, true_sds.tolist(), strict=True))
     name = fit.config.name or study.record.origin
@@ -333,7 +341,9 @@ def export(
     return model
 
 
-def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
+def at_rate(
+    actuator: Actuator, rate: float | None, hold: Hold, conditions: Mapping[str, float]
+) -> Actuator:
     """Return an actuator at a controller's pace: samples a second up to 10 MHz, with this hold.
 
     Raises InputError: a rate that is not above zero, or is too high.
@@ -341,7 +351,7 @@ def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
     if rate is not None and not 0 < rate <= 1e7:
         raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {1e7:g}")
     interval = actuator.interval if rate is None else 1 / rate
-    return replace(actuator, interval=interval, hold=hold)
+    return replace(actuator, interval=interval, hold=hold, conditions=conditions)
 
 
 def track(
@@ -353,6 +363,7 @@ def track(
     slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
+    at: Mapping[str, str | float] | None = None,
     beyond_training: bool = False,
     rate: float = 1000.0,
     delay: int = 1,
@@ -385,8 +396,10 @@ def track(
         Its largest current, A; with the capacitance.
     capacitance
         The actuator's capacitance, F.
+    at
+        Constant value of a covariate that the model follows, as temperature_degC=25.
     beyond_training
-        Allows voltages beyond those that were fitted, where nothing is known of the error.
+        Allows voltages and covariates beyond those fitted, where nothing is known of the error.
     rate
         Samples a second.
     delay
@@ -427,6 +440,7 @@ def track(
     limits = amplifier_limits(
         study, voltage, slew, current, capacitance, beyond_training=beyond_training
     )
+    conditions = conditions_at(study, at, beyond_training=beyond_training)
     instruments, count = study.record.instruments, len(parameters)
     rng = study.generator("instruments")
     displacements = instruments.displacements(count, alone.single_record.extent, rng)
@@ -435,7 +449,7 @@ def track(
         return displacements(slice(None), read.reshape(-1, count).T).T.reshape(read.shape)
 
     tracking = tracked(
-        at_rate(dataset.actuator, rate, "zero"),
+        at_rate(dataset.actuator, rate, "zero", conditions),
         dataset.table.actuator(theta[:draws]),
         LoopNoise(dataset.noise, parameters),
         Stand(limits, delay),

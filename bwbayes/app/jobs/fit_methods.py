@@ -11,7 +11,7 @@ import sys
 import tempfile
 import warnings
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from inspect import signature
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.fit.fitted import Run
+from bwbayes.diagnosis.extrapolation import covariate_range
 from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.inference.study import Study
 from bwbayes.model.inputs import Limits, Span
@@ -91,6 +92,41 @@ def amplifier_limits(
             "allow it with beyond_training (--beyond-training)"
         )
     return Limits(low, high, math.inf if slew is None else slew, current, capacitance)
+
+
+def conditions_at(
+    study: Study, at: Mapping[str, str | float] | None, *, beyond_training: bool = False
+) -> dict[str, float]:
+    """Return the constant values of the covariates that a model follows, by name.
+
+    Raises InputError: one is missing, unknown or no number, or goes beyond those fitted, which has
+    to be allowed.
+    """
+    stages, given, conditions = study.posterior.datasets[0].actuator.stages, dict(at or {}), {}
+    for name in sorted({name for stage in stages for name in stage.sees} - {"time", "voltage"}):
+        if name not in given:
+            raise InputError(
+                f"{name}: the model follows it, and it is not given; give its constant value in at "
+                f"(--at {name}=VALUE)"
+            )
+        try:
+            value = float(given.pop(name))
+        except ValueError:
+            value = math.nan
+        trained = covariate_range(study.posterior, name)
+        slack = 0.02 * (trained.high - trained.low)
+        if not math.isfinite(value):
+            raise InputError(f"at: {name} is not a finite number; give one")
+        if not beyond_training and not trained.low - slack <= value <= trained.high + slack:
+            raise InputError(
+                f"at: {name} {value:g} is beyond the {trained.low:g} to {trained.high:g} that were "
+                "fitted, where nothing is known of the error; give a value within these, or allow "
+                "it with beyond_training (--beyond-training)"
+            )
+        conditions[name] = value
+    for name in given:
+        raise InputError(f"at: the model does not follow {name}; leave it out")
+    return conditions
 
 
 class Scratch:
