@@ -19,7 +19,7 @@ from hypothesis import given, strategies as st
 import bwbayes
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.commands.command import as_typed
+from bwbayes.app.commands.cli import as_typed
 from bwbayes.app.jobs.simulate import simulate
 from bwbayes.app.verbs import VERBS
 from bwbayes.errors import InputError, one_line

@@ -19,8 +19,7 @@ import pandas as pd
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.cli import cli
-from bwbayes.app.commands.command import finish
+from bwbayes.app.commands.cli import cli, finish
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray

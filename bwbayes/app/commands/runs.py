@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.command import (
+from bwbayes.app.commands.cli import (
     command_as_typed,
     finish,
     present,
