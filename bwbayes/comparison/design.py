@@ -41,6 +41,7 @@ from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.record.record import Record
 from bwbayes.report.report import (
     Banner,
+    Block,
     Facts,
     Picture,
     Product,
@@ -167,10 +168,19 @@ class Design(Product, Sequence[DesignScore]):
             if score.sd_ratio - best.sd_ratio < 2 * float(np.hypot(score.error, best.error))
         ]
 
+    @property
+    def chosen(self) -> dict[str, tuple[str, DesignScore]]:
+        """What to measure: a title and a candidate, by the name of the signal's file."""
+        return {"best": ("The best signal", self.best)}
+
     def records(self) -> dict[str, Record]:
-        """Return the best signal as a record that a signal generator can play."""
-        best = self.signals[self.best.name]
-        return {"best": Record(best, None, interval=self.interval, voltage_is="command")}
+        """Return what to measure as records that a signal generator can play."""
+        return {
+            name: Record(
+                self.signals[score.name], None, interval=self.interval, voltage_is="command"
+            )
+            for name, (_, score) in self.chosen.items()
+        }
 
     def numbers(self) -> dict[str, object]:
         """Return what ``design.json`` holds."""
@@ -180,56 +190,75 @@ class Design(Product, Sequence[DesignScore]):
             "best": self.best.name,
             "amplifier": asdict(self.amplifier),
             "candidates": [asdict(score) for score in self.scores],
+            **{name: score.name for name, (_, score) in self.chosen.items()},
         }
 
     def report(self) -> Report:
-        """Return which signal teaches most, by how much, and what it looks like, to be shown."""
-        from bwbayes.report.figures.products import draw_promises  # noqa: PLC0415
+        """Return what to measure, what it teaches, and what it looks like, to be shown."""
         from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415
 
-        best, amplifier = self.best, self.amplifier
-        feasible = [score for score in self.scores if not score.refused]
-        names = [score.name for score in feasible]
-        remaining, error = np.array([(p.sd_ratio, p.error) for p in feasible]).T
-        lines = [
-            f"{self.quantity} after one more record of it: {best.sd_ratio:.1%} ± {best.error:.1%}"
-        ]
-        if self.tied:
-            lines.append(f"indistinguishable from it: {', '.join(self.tied)}")
-        limits = amplifier.low, amplifier.high
+        amplifier = self.amplifier
         rate = f", at most {amplifier.rate:.4g} V/s" if np.isfinite(amplifier.rate) else ""
         facts = [
             ("Run", self.run),
             ("Target", self.quantity.replace(" left", "")),
-            ("Amplifier", "{:.4g} to {:.4g} V".format(*limits) + rate),
+            ("Amplifier", f"{amplifier.low:.4g} to {amplifier.high:.4g} V{rate}"),
             ("Sampling interval", f"{self.interval:g} s"),
         ]
-        signal = record_pictures(self.records()["best"], (), ())["time"]
-        shown = "Its voltage, as best.csv has it for the signal generator."
+        signals = [
+            replace(
+                record_pictures(record, (), ())["time"],
+                name=name,
+                title=f"{self.chosen[name][0]}: {self.chosen[name][1].name}",
+                caption=f"Its voltage, as {name}.csv has it for the signal generator.",
+            )
+            for name, record in self.records().items()
+        ]
         return Report(
             title="What to measure next",
             banners=[
                 *standing_banner(self.standing),
-                Banner(kind_of(self.standing), f"Best: {best.name}", lines),
+                *self._answers(),
                 *remarks_banner(
                     [f"{p.name} {p.refused}" for p in self.scores if p.refused],
                     "What the amplifier cannot make",
                 ),
             ],
             blocks=[
-                self._table(),
-                Picture(
-                    "promises",
-                    "What each candidate would leave",
-                    "The part that is expected to be left after one more record, with two Monte "
-                    "Carlo errors to either side; at 100% a signal teaches nothing new.",
-                    partial(draw_promises, names, remaining, error, self.quantity),
-                ),
-                replace(signal, name="best", title=f"The best signal: {best.name}", caption=shown),
+                *self._comparison(),
+                *signals,
                 Section("Request", [Facts(facts)], folded=False),
             ],
             numbers=self.numbers(),
         )
+
+    def _answers(self) -> list[Banner]:
+        """Return what to measure, and what it teaches."""
+        best = self.best
+        lines = [
+            f"{self.quantity} after one more record of it: {best.sd_ratio:.1%} ± {best.error:.1%}"
+        ]
+        if self.tied:
+            lines.append(f"indistinguishable from it: {', '.join(self.tied)}")
+        return [Banner(kind_of(self.standing), f"Best: {best.name}", lines)]
+
+    def _comparison(self) -> list[Block]:
+        """Return the candidates side by side."""
+        from bwbayes.report.figures.products import draw_promises  # noqa: PLC0415
+
+        feasible = [score for score in self.scores if not score.refused]
+        names = [score.name for score in feasible]
+        remaining, error = np.array([(p.sd_ratio, p.error) for p in feasible]).T
+        return [
+            self._table(),
+            Picture(
+                "promises",
+                "What each candidate would leave",
+                "The part that is expected to be left after one more record, with two Monte "
+                "Carlo errors to either side; at 100% a signal teaches nothing new.",
+                partial(draw_promises, names, remaining, error, self.quantity),
+            ),
+        ]
 
     def _table(self) -> Table:
         rows = []
@@ -293,27 +322,16 @@ class RivalDesign(Design):
         """The quantity whose remaining part the scores are, in words."""
         return "difference of rivals left"
 
-    def records(self) -> dict[str, Record]:
-        """Return both signals as records that a signal generator can play."""
+    @property
+    def chosen(self) -> dict[str, tuple[str, DesignScore]]:
+        """What to measure: a title and a candidate, by the name of the signal's file."""
         return {
-            name: Record(
-                self.signals[score.name], None, interval=self.interval, voltage_is="command"
-            )
-            for name, score in (("validate", self.validation), ("train", self.training))
+            "validate": ("Validation record", self.validation),
+            "train": ("Training record", self.training),
         }
 
-    def numbers(self) -> dict[str, object]:
-        """Return what ``design.json`` holds."""
-        return {
-            **super().numbers(),
-            "validate": self.validation.name,
-            "train": self.training.name,
-        }
-
-    def report(self) -> Report:
-        """Return which signals tell the model from its rivals, and by how much, to be shown."""
-        from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415
-
+    def _answers(self) -> list[Banner]:
+        """Return which signals tell the model from its rivals, and by how much."""
         validation, training = self.validation, self.training
         seconds = self.interval * self.signals[validation.name].size
         differ = (
@@ -324,49 +342,14 @@ class RivalDesign(Design):
             f"fitted, too, it would leave {training.sd_ratio:.0%} of the rivals' differences, and "
             f"tell {training.told_apart:.0%} of all pairs of models apart"
         )
-        files = {
-            "validate": f"Validation record: {validation.name}",
-            "train": f"Training record: {training.name}",
-        }
-        pictures = [
-            replace(
-                record_pictures(record, (), ())["time"],
-                name=name,
-                title=files[name],
-                caption=f"Its voltage, as {name}.csv has it for the signal generator.",
-            )
-            for name, record in self.records().items()
+        headline = f"Validate on: {validation.name}, {seconds:.3g} s"
+        return [
+            Banner(kind_of(self.standing), headline, [differ]),
+            Banner("note", f"Train on: {training.name}", [training_text]),
         ]
-        facts = [
-            ("Run", self.run),
-            ("Voltages", f"{self.amplifier.low:.4g} to {self.amplifier.high:.4g} V"),
-            ("Fastest", f"{self.amplifier.rate:.4g} V/s"),
-            ("Sampling interval", f"{self.interval:g} s"),
-        ]
-        return Report(
-            title="What to measure next",
-            banners=[
-                *standing_banner(self.standing),
-                Banner(
-                    kind_of(self.standing),
-                    f"Validate on: {validation.name}, {seconds:.3g} s",
-                    [differ],
-                ),
-                Banner("note", f"Train on: {training.name}", [training_text]),
-                *remarks_banner(
-                    [f"{p.name} {p.refused}" for p in self.scores if p.refused],
-                    "What the amplifier cannot make",
-                ),
-            ],
-            blocks=[
-                self._rivals_table(),
-                *pictures,
-                Section("Request", [Facts(facts)], folded=False),
-            ],
-            numbers=self.numbers(),
-        )
 
-    def _rivals_table(self) -> Table:
+    def _comparison(self) -> list[Block]:
+        """Return the candidates side by side."""
         rows = []
         for score in self.scores:
             cells = (
@@ -377,7 +360,7 @@ class RivalDesign(Design):
             )
             rows.append((score.name, *("–" if score.refused else cell for cell in cells)))
         columns = ("Candidate", "Rivals differ by", "Over SD", "Left if fitted", "Told apart")
-        return Table(
+        table = Table(
             "candidates",
             "Rivals along the candidates",
             columns,
@@ -390,6 +373,7 @@ class RivalDesign(Design):
             "evidence would differ by odds of more than twenty to one.",
             on="both",
         )
+        return [table]
 
 
 def rank_designs(
