@@ -42,8 +42,18 @@ class Carrier(Protocol):
 
 
 @dataclass(frozen=True)
-class _Periodic:
-    """Fields and checks that a sine and a triangle share."""
+class Sine:
+    """``v = amplitude sin(2 pi frequency t + phase)``: equation (1) of the paper.
+
+    Parameters
+    ----------
+    amplitude : float
+        V.
+    frequency : float
+        Hz, above zero.
+    phase : float
+        Phase at the start, rad; with pi the voltage goes down first.
+    """
 
     amplitude: float
     frequency: float
@@ -60,26 +70,12 @@ class _Periodic:
         """The fundamental frequency, Hz."""
         return self.frequency
 
-
-class Sine(_Periodic):
-    """``v = amplitude sin(2 pi frequency t + phase)``: equation (1) of the paper.
-
-    Parameters
-    ----------
-    amplitude : float
-        V.
-    frequency : float
-        Hz, above zero.
-    phase : float
-        Phase at the start, rad; with pi the voltage goes down first.
-    """
-
     def __call__(self, elapsed: FloatArray) -> FloatArray:
         """Voltage (samples,) in V at the times (samples,) in s since the start."""
         return self.amplitude * np.sin(2 * np.pi * self.frequency * elapsed + self.phase)
 
 
-class Triangle(_Periodic):
+class Triangle(Sine):
     """A triangle with the zeros and peaks of the :class:`Sine` of the same parameters.
 
     Its slope is ``+-4 amplitude frequency`` (V/s); the harmonics of its corners alias.

@@ -168,7 +168,7 @@ def sampled_waveform(drive: str | SignalConfig) -> Waveform:
     """Return the waveform of that name, or the one a config describes."""
     if isinstance(drive, str):
         return signal(drive)
-    carrier: Staircase | Sine | Triangle
+    carrier: Staircase | Sine
     if drive.shape == "steps":
         carrier = Staircase(tuple(drive.levels or ()), drive.dwell or 0.0)
     else:
