@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 import bwbayes as bw
-from bwbayes.app.fit.calls import config_of
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.design import RivalDesign, RivalScore

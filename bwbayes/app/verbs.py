@@ -233,12 +233,12 @@ COMMANDS = (
     ),
     Verb("bwbayes.app.jobs.simulate:simulate"),
     Verb(
-        "bwbayes.app.config.config:config_reference",
+        "bwbayes.app.config.reference:config_reference",
         command="config",
         flags={"requested": "KEY"},
     ),
     Verb(
-        "bwbayes.app.config.config:parts_reference",
+        "bwbayes.app.config.reference:parts_reference",
         command="models",
         flags={"requested": "NAME"},
         parts=True,

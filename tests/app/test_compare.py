@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.fit.calls import config_of
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError, InputWarning

@@ -13,7 +13,7 @@ import pytest
 
 import bwbayes
 from bwbayes.app.config.config import parse
-from bwbayes.app.fit.calls import config_of
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.running.folder import RunFolder

@@ -16,7 +16,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.config.config import load, parse
-from bwbayes.app.fit.calls import config_of
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run
 from bwbayes.app.jobs.predict import planned_noise
 from bwbayes.app.running.explaining import search_stages

@@ -20,7 +20,7 @@ import pytest
 from rich.console import Console
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.fit.calls import config_of, models_of
+from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.running.folder import RunFolder

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.fit.calls import config_of
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.fit.calls import config_of
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.control import export
 from bwbayes.app.jobs.fit_methods import amplifier_limits

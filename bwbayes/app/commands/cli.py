@@ -97,7 +97,7 @@ class WithParts(click.Command):
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the parts, by kind."""
         # Here, because it is slow to load.
-        from bwbayes.app.config.config import PARTS
+        from bwbayes.app.config.reference import PARTS
 
         del ctx
         with formatter.section("Parts"):
