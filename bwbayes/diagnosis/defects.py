@@ -24,7 +24,7 @@ from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import Distribution, normal
 from bwbayes.model.registry import STAGES
 from bwbayes.model.stages.additions import Oscillation
-from bwbayes.model.stages.delay import Delay
+from bwbayes.model.stages.lags import Delay
 from bwbayes.model.stages.sensor import ReversedSign
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record

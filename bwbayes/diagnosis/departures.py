@@ -24,9 +24,8 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.defects import DEFECTS
-from bwbayes.diagnosis.explanations import likely_causes
+from bwbayes.diagnosis.explanations import likely_causes, tail_nats
 from bwbayes.diagnosis.finding import Finding, join_findings
-from bwbayes.diagnosis.model import tail_nats
 from bwbayes.diagnosis.series_patterns import Line, scatter, strongest_line
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.noise import DiscrepancyNoise

@@ -55,7 +55,7 @@ STAGES: Mapping[str, Callable[..., Stage]] = {
     for stage in (
         resolve_name(f"bwbayes.model.stages.{path}")
         for path in (
-            "delay:Delay",
+            "lags:Delay",
             "lags:AmplifierLag",
             "amplifier_limits:SlewLimit",
             "amplifier_limits:Saturation",

@@ -218,7 +218,7 @@ def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
 
 
 def test_a_model_in_a_line_may_have_parts_from_outside() -> None:
-    noise, stage = "bwbayes.inference.noise:SmoothNoise", "bwbayes.model.stages.delay:Delay"
+    noise, stage = "bwbayes.inference.noise:SmoothNoise", "bwbayes.model.stages.lags:Delay"
     (model,) = models_of(f"linear + {stage} + {noise} + student", BASE).values()
     assert (model.stages, model.noise) == ([stage], f"{noise} + student")
 

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from bwbayes.app.study.about import findings_of
-from bwbayes.diagnosis import explanations, model, residual_analysis as scenes
+from bwbayes.diagnosis import explanations, residual_analysis as scenes
 from bwbayes.diagnosis.defects import DEFECTS, LONG_DELAY
 from bwbayes.diagnosis.explanations import (
     LIMIT,
@@ -84,16 +84,16 @@ def test_outliers_are_no_cause_where_none_would_be_set_aside() -> None:
     """Levels of a coarse sensor are not normal either, and none is far."""
     coarse = np.zeros(3000)
     coarse[::7], coarse[3::7] = 3.0, -3.0
-    assert model.tail_nats(coarse) > LIMIT
+    assert explanations.tail_nats(coarse) > LIMIT
     seen: Any = SimpleNamespace(innovations=coarse, without=(1.0,), lead=0.0, alone=False)
     readings, seen.study = SimpleNamespace(values=coarse), SimpleNamespace(spec=None)
     seen.posterior = SimpleNamespace(
         single_record=SimpleNamespace(readings=readings, noise=DiscrepancyNoise())
     )
     seen.fit = SimpleNamespace(displacement=np.zeros(3000))
-    assert [] == [*model.heavy_tails(seen)]
+    assert [] == [*explanations.heavy_tails(seen)]
     coarse[8] = 600.0
-    (found,) = model.heavy_tails(seen)
+    (found,) = explanations.heavy_tails(seen)
     assert found.rmse[1] == pytest.approx(np.sqrt(2 * 9 / 7), rel=0.01)
 
 
@@ -108,7 +108,7 @@ def test_outliers_are_set_aside_where_they_are_few_and_far(kind: str) -> None:
         count = {"tails": 0, "few far": int(rng.integers(5, 60)), "many far": 200}[kind]
         white[:count] += rng.uniform(8, 100) * rng.choice([-1, 1], count)
         white /= np.std(white)
-        aside = model.isolated_nats(white) > model.tail_nats(white)
+        aside = explanations.isolated_nats(white) > explanations.tail_nats(white)
         assert aside == (kind == "few far")
 
 
@@ -118,11 +118,11 @@ FAMILIES: dict[str, Callable[[ResidualAnalysis], Iterator[Explanation]]] = {
     "step": DEFECTS["step"].explanations,
     "moving gain": DEFECTS["moving gain"].explanations,
     "delay": DEFECTS["delay"].explanations,
-    "outliers": model.heavy_tails,
-    "noise by speed": model.growing_noise,
-    "quadratic": model.nonlinearity,
-    "creep": model.creep,
-    "free exponent": model.exponent,
+    "outliers": explanations.heavy_tails,
+    "noise by speed": explanations.growing_noise,
+    "quadratic": explanations.nonlinearity,
+    "creep": explanations.creep,
+    "free exponent": explanations.exponent,
     "series plays": DEFECTS["series plays"].explanations,
 }
 
@@ -227,7 +227,9 @@ def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
     prior = f'{{ distribution = "lognormal", median = {truth}, sigma = 0.02 }}'
     seen = scene("good", 0, tmp_path, 5.0, f"{name} = {{ prior = {prior} }}")
     defects = (DEFECTS[kind].explanations for kind in ("transient", "drift", "moving gain"))
-    found = [explanation for family in (model.prior, *defects) for explanation in family(seen)]
+    found = [
+        explanation for family in (explanations.prior, *defects) for explanation in family(seen)
+    ]
     likely = likely_causes(sorted(found, key=lambda each: -each.nats))
     assert ([] if factor == 1.0 else [f"prior of {name}"]) == [each.kind for each in likely]
     for each in likely:
@@ -309,7 +311,7 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
     assert len(fitted) == len(explanations.ADDITIONS) + 1
     (tmp_path / "other").mkdir()
     large = scene("cubic", 0, tmp_path / "other", 5.0)
-    gained = max(found.nats for found in model.nonlinearity(large))
+    gained = max(found.nats for found in explanations.nonlinearity(large))
     assert LIMIT < gained < large.unexplained
 
 
@@ -380,12 +382,12 @@ def test_plays_that_a_first_load_has_moved_are_told_from_plays_that_ran(
     study = study_of(text, tmp_path)
     point = pointfit.fit(study.posterior, rng)
     analysis = ResidualAnalysis.of(study.posterior, point.optima, rng, study)
-    (history,) = model.history(analysis)
+    (history,) = explanations.history(analysis)
     assert (history.nats > 100) if loaded else (history.nats < 0)
     # The fix, once it is taken, is the whole cure.
     assert history.spec is not None
     cured = replace(analysis, study=study.with_model(history.spec))
-    assert not [*model.history(cured)]
+    assert not [*explanations.history(cured)]
 
 
 def test_ties_are_both_named_and_one_that_removes_readings_must_lead() -> None:
@@ -449,7 +451,7 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
         assert stride == seen.stride
         assert 500 == seen.posterior.single_record.readings.rows.size
         late, growing = (DEFECTS[defect].explanations for defect in ("delay", "moving gain"))
-        families = late, growing, model.creep, model.hold
+        families = late, growing, explanations.creep, explanations.hold
         found = [explanation for family in families for explanation in family(seen)]
         found.sort(key=lambda explanation: explanation.nats)
         nats[stride] = {explanation.kind: explanation.nats for explanation in found}
@@ -468,12 +470,12 @@ def test_what_leads_on_some_readings_is_weighed_on_all(
 ) -> None:
     """As if all had been looked at from the beginning."""
     monkeypatch.setattr(explanations, "ADDITIONS", ())
-    monkeypatch.setattr(explanations, "CHANGES", (model.nonlinearity,))
+    monkeypatch.setattr(explanations, "CHANGES", (explanations.nonlinearity,))
     full = explain(scene("cubic", 0, tmp_path, 8.0))[0]
     monkeypatch.setattr(scenes, "READINGS", 200)
     few = scene("cubic", 0, tmp_path, 8.0)
     assert few.posterior.single_record.readings.rows.size <= 200
-    on_few = max(model.nonlinearity(few), key=lambda found: found.nats)
+    on_few = max(explanations.nonlinearity(few), key=lambda found: found.nats)
     found = explain(few)[0]
     assert (found.kind, found.text) == (full.kind, full.text)
     assert found.nats == pytest.approx(full.nats, abs=0.5)

@@ -36,7 +36,7 @@ from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
 from bwbayes.model.stages.amplifier_limits import Saturation
 from bwbayes.model.stages.covariates import Temperature
-from bwbayes.model.stages.delay import Delay
+from bwbayes.model.stages.lags import Delay
 from bwbayes.record.teststand import RING_BENDER, true_values
 from tests.control.compiled import Compiled
 from tests.programs import needs

@@ -12,7 +12,7 @@ import pytest
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Span
 from bwbayes.model.operators.scalar_memory import OneState
-from bwbayes.model.stages.delay import Delay
+from bwbayes.model.stages.lags import Delay
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.histories import States, choose_histories
 from bwbayes.prediction.initial_state import estimate_initial_states

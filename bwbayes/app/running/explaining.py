@@ -21,11 +21,10 @@ import numpy as np
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.resolve import with_model
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
+from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes, without
 from bwbayes.diagnosis.finding import TELLING_DRIVE
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
-from bwbayes.diagnosis.model import without
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import stopwatch
