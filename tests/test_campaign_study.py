@@ -154,9 +154,9 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
         # Draws of a finite number: a specimen that is all sure stays as wide.
         assert result[name]["width"] < 1.02
         told = ended.population.parameters[name]
-        for values, truth in ((told.mean, median), (told.spread, spread)):
+        for drawn, truth in ((told.mean, median), (told.spread, spread)):
             # 99.9%, for there is one population.
-            assert np.quantile(values, 0.0005) < truth < np.quantile(values, 0.9995), name
+            assert np.quantile(drawn, 0.0005) < truth < np.quantile(drawn, 0.9995), name
     for level in ("50", "90", "95"):
         inside = [
             r.numbers["validation"]["end"]["coverage"]["sensor"][level] for r in fitted.values()
