@@ -151,7 +151,8 @@ def test_a_defect_of_ones_own_is_named_where_it_is(
     assert record.displacement is not None
     swaying = record.displacement + size * np.sin(2 * np.pi * 2.7 * record.time)
     bwbayes.write_record(replace(record, displacement=swaying), tmp_path / "record.h5")
-    study = study_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    text = '[record]\nfile = "record.h5"\nfrom_rest = true\n[model]\nnoise = "discrepancy"\n'
+    study = study_of(text, tmp_path)
     rng = np.random.default_rng(1)
     optima = map_estimate.fit(study.posterior, rng).optima
     ranked = explanations.explain(ResidualAnalysis.of(study.posterior, optima, rng, study))

@@ -71,10 +71,11 @@ ASIDE = "[model]\noutliers = true\n"
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: int) -> None:
     record, rows = spiky(measured(seed), seed)
+    noise = 'noise = "discrepancy"\n'
     clean, aside, left_in = (
-        told(measured(seed), tmp_path),
-        told(record, tmp_path, ASIDE),
-        told(record, tmp_path),
+        told(measured(seed), tmp_path, f"[model]\n{noise}"),
+        told(record, tmp_path, f"{ASIDE}{noise}"),
+        told(record, tmp_path, f"[model]\n{noise}"),
     )
     assert (
         rows == np.flatnonzero(np.isnan(aside.study.posterior.single_record.displacement)).tolist()

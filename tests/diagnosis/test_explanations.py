@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from bwbayes.app.study.about import findings_of
+from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis import explanations, residual_analysis as scenes
 from bwbayes.diagnosis.defects import DEFECTS, LONG_DELAY
 from bwbayes.diagnosis.explanations import (
@@ -26,24 +27,41 @@ from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.diagnosis.series_patterns import strongest_line
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.study import Stated
+from bwbayes.inference.study import Stated, Study
 from bwbayes.model.declaration import normal
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, FINE, RATE, Plant, drawn, hysteresis, lagged, plant
 from tests.prediction.runs import covered, judge, study_of
 from tests.stand import Stand, play
 
+# The noise of the plants' errors, which need not be looked for.
+REST = """
+[record]
+file = "record.h5"
+from_rest = true
+[model]
+noise = "discrepancy"
+"""
+AUTO = REST.replace("discrepancy", "auto")
+
+
+def fitted_plant(
+    kind: str, seed: int, folder: Path, seconds: float = 10.0, text: str = REST
+) -> tuple[Study, FloatArray]:
+    """Return a study of a plant's record, and its optima."""
+    write_record(plant(kind, (5, seed), seconds), folder / "record.h5")
+    study = study_of(text, folder)
+    return study, pointfit.fit(study.posterior, np.random.default_rng(seed)).optima
+
+
+def analysis_of(study: Study, optima: FloatArray) -> ResidualAnalysis:
+    return ResidualAnalysis.of(study.posterior, optima, np.random.default_rng(0), study)
+
 
 def scene(
-    kind: str, seed: int, folder: Path, seconds: float = 10.0, parameters: str = ""
+    kind: str, seed: int, folder: Path, seconds: float = 10.0, text: str = REST
 ) -> ResidualAnalysis:
-    (folder / "record.h5").unlink(missing_ok=True)
-    write_record(plant(kind, (5, seed), seconds), folder / "record.h5")
-    text = f'[record]\nfile = "record.h5"\nfrom_rest = true\n[parameters]\n{parameters}\n'
-    study = study_of(text, folder)
-    rng = np.random.default_rng(seed)
-    point = pointfit.fit(study.posterior, rng)
-    return ResidualAnalysis.of(study.posterior, point.optima, rng, study)
+    return analysis_of(*fitted_plant(kind, seed, folder, seconds, text))
 
 
 LINEAR = """
@@ -132,7 +150,9 @@ def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     kind: str, tmp_path: Path
 ) -> None:
     """What the actuator has not done keeps a fit from passing, whatever its bands cover."""
-    best = max(FAMILIES[kind](scene(kind, 0, tmp_path, 5.0)), key=lambda found: found.nats)
+    text = AUTO if kind == "free exponent" else REST  # beside a smooth error alone
+    seen = scene(kind, 0, tmp_path, 5.0, text)
+    best = max(FAMILIES[kind](seen), key=lambda found: found.nats)
     assert best.kind in CAUSES.get(kind, {kind})
     assert best.nats > LIMIT
     assert bool(followed_causes([best])) is (kind in {"transient", "drift", "step", "outliers"})
@@ -142,6 +162,8 @@ LATE = (-0.25, -0.04, 0.1)
 NEXT = """
 [record]
 file = "record.h5"
+[model]
+noise = "discrepancy"
 [validation.next]
 file = "next.h5"
 """
@@ -225,7 +247,7 @@ def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
     """With an sd of a fiftieth; the twin: one that has the truth in its middle is none."""
     truth = factor * getattr(drawn(np.random.default_rng((5, 0))), name)
     prior = f'{{ distribution = "lognormal", median = {truth}, sigma = 0.02 }}'
-    seen = scene("good", 0, tmp_path, 5.0, f"{name} = {{ prior = {prior} }}")
+    seen = scene("good", 0, tmp_path, 5.0, f"{REST}[parameters]\n{name} = {{ prior = {prior} }}")
     defects = (DEFECTS[kind].explanations for kind in ("transient", "drift", "moving gain"))
     found = [
         explanation for family in (explanations.prior, *defects) for explanation in family(seen)
@@ -271,7 +293,7 @@ def test_a_step_among_readings_that_are_held_out_has_its_own_time(
 ) -> None:
     """Not that of the first reading after them, where the fit comes upon it."""
     write_record(plant("good", (5, 2), 5.0), tmp_path / "record.h5")
-    study = study_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    study = study_of(REST, tmp_path)
     shifted = study.posterior.single_record.displacement + 5.0 * (study.record.time >= time)
     windows = slice(0, 320), slice(480, 1000)
     posterior = study.posterior.altered(displacement=shifted, training=windows)
@@ -300,10 +322,8 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
     good = Stand(discrepancy=0.0, sensor=0.1)
     record = good.measure(100 * np.sin(0.02 * np.pi * np.arange(800.0)), np.random.default_rng(1))
     write_record(record, tmp_path / "record.h5")
-    study = study_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
-    rng = np.random.default_rng(0)
-    optima = pointfit.fit(study.posterior, rng).optima
-    small = ResidualAnalysis.of(study.posterior, optima, rng, study)
+    study = study_of(REST, tmp_path)
+    small = analysis_of(study, pointfit.fit(study.posterior, np.random.default_rng(0)).optima)
     assert small.unexplained < LIMIT
     fitted: list[float] = []
     explain(small, fitted.append)
@@ -322,7 +342,7 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     slew_limit = DEFECTS["slew limit"].explanations
     monkeypatch.setattr(explanations, "ADDITIONS", (DEFECTS["drift"].explanations,))
     monkeypatch.setattr(explanations, "CHANGES", (slew_limit,))
-    slow = scene("slew limit", 1, tmp_path, 5.0)
+    slow = scene("slew limit", 1, tmp_path, 5.0, AUTO)
     found = explain(slow)
     beside_smooth = max(each.nats for each in slew_limit(slow))
     assert beside_smooth < found[0].nats - 20
@@ -440,14 +460,14 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
     None but the best gains by it: a delay's evidence is exact to a nat, since the path has corners.
     What does not move the drive's reversals loses nothing either.
     """
-    nats = {}
+    nats, (study, optima) = {}, fitted_plant(kind, 2, tmp_path)
     monkeypatch.setattr("bwbayes.diagnosis.residual_analysis.READINGS", 500)
     for stride in (4, 1):
         if stride == 1:
             monkeypatch.setattr(
                 "bwbayes.diagnosis.residual_analysis.thin_posterior", lambda whole, *_: whole
             )
-        seen = scene(kind, 2, tmp_path)
+        seen = analysis_of(study, optima)
         assert stride == seen.stride
         assert 500 == seen.posterior.single_record.readings.rows.size
         late, growing = (DEFECTS[defect].explanations for defect in ("delay", "moving gain"))
@@ -471,9 +491,10 @@ def test_what_leads_on_some_readings_is_weighed_on_all(
     """As if all had been looked at from the beginning."""
     monkeypatch.setattr(explanations, "ADDITIONS", ())
     monkeypatch.setattr(explanations, "CHANGES", (explanations.nonlinearity,))
-    full = explain(scene("cubic", 0, tmp_path, 8.0))[0]
+    study, optima = fitted_plant("cubic", 0, tmp_path, 8.0, AUTO)
+    full = explain(analysis_of(study, optima))[0]
     monkeypatch.setattr(scenes, "READINGS", 200)
-    few = scene("cubic", 0, tmp_path, 8.0)
+    few = analysis_of(study, optima)
     assert few.posterior.single_record.readings.rows.size <= 200
     on_few = max(explanations.nonlinearity(few), key=lambda found: found.nats)
     found = explain(few)[0]
