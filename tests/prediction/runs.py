@@ -29,7 +29,7 @@ from bwbayes.sampling.proposals import StudentMixture
 
 # Draws of each round, to which the mixture of the next one is fitted; draws of the last; those that
 # stay. Three rounds find a tail that is several times as long as the point fit's sd says.
-PILOT, ROUNDS, DRAWS, KEPT = 2000, 4, 8000, 250
+PILOT, ROUNDS, DRAWS, KEPT = 1000, 4, 4000, 250
 
 # No draw of the pilot weighs more than so many times the mean.
 HEAVIEST = 10.0
