@@ -385,11 +385,11 @@ def test_halves_with_a_discrepancy_are_the_whole() -> None:
         inputs = Inputs(voltage, interval=INTERVAL)
         return Likelihood(inputs, reading, training, actuator, noise, True, name)
 
-    one = joint(half("whole", *windows))
+    one = joint(half("whole", *windows), engine="numba")
     halves = [half(f"half-{i}", window) for i, window in enumerate(windows)]
     points = {}
     for shared in (("initial", "offset"), ("initial",)):
-        two = joint(*halves, shared=shared)
+        two = joint(*halves, shared=shared, engine="numba")
         points[shared] = two, pointfit.fit(two, np.random.default_rng(1))
     whole = pointfit.fit(one, np.random.default_rng(1))
     sd = np.sqrt(np.diag(whole.covariance))

@@ -1,5 +1,7 @@
 """A thinned record: its path, its readings, and that what is searched in it is found in all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -149,7 +151,7 @@ def test_what_is_searched_in_a_thinned_record_is_found_on_the_whole(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The mode and its curvature are those that a search in the whole record finds."""
-    whole = short_posterior(samples=4000, dynamics="lag")
+    whole = replace(short_posterior(samples=4000, dynamics="lag"), engine="numba")
     slow = map_estimate.fit(whole, np.random.default_rng(1))
     searched: list[int] = []
 
@@ -178,7 +180,7 @@ def test_a_whole_record_is_climbed_from_near_its_mode(monkeypatch: pytest.Monkey
     posterior = posterior_of(voltage, readings, actuator, "discrepancy")
     clean = displacement(posterior, posterior.single_record, truth(posterior))[0]
     readings = clean + np.random.default_rng(2).normal(0.0, 0.02, voltage.size)
-    whole = posterior_of(voltage, readings, actuator, "discrepancy")
+    whole = replace(posterior_of(voltage, readings, actuator, "discrepancy"), engine="numba")
     starts, ends = dict[bool, FloatArray](), dict[bool, FloatArray]()
 
     def noted(searched: Posterior, start: FloatArray, covariance: FloatArray) -> Mode:
