@@ -324,10 +324,10 @@ def test_holm_is_the_textbooks() -> None:
 
 
 def test_sound_calibrations_pass_but_for_the_family_level() -> None:
-    """Both tests of all statistics together, over 400 calibrations of 60 replicates."""
-    failed = [not judged(entries(scores(60, seed))).passed for seed in range(400)]
+    """Both tests of all statistics together, over 200 calibrations of 60 replicates."""
+    failed = [not judged(entries(scores(60, seed))).passed for seed in range(200)]
     # The smooth test's tail is a little too long with so few replicates.
-    assert np.mean(failed) < 1.3 * FAMILY_LEVEL + 4 * np.sqrt(FAMILY_LEVEL / 400)
+    assert np.mean(failed) < 1.3 * FAMILY_LEVEL + 4 * np.sqrt(FAMILY_LEVEL / 200)
 
 
 @pytest.mark.parametrize("defect", ["sds a fifth too small", "a bias of 0.3 sd", "two peaks"])
