@@ -1,8 +1,8 @@
 """An operator that is not in the package goes by its import path, and does all that others do.
 
-Twenty lines are enough for one: a loop whose branches are hyperbolic tangents, which obeys Masing's
-rules and so has the memory of Preisach's kin. A step along a straight piece of the voltage is the
-other way to write one.
+Twenty lines are enough for one: CONTRIBUTING shows a loop whose branches are hyperbolic tangents,
+which obeys Masing's rules and so has the memory of Preisach's kin. A step along a straight piece of
+the voltage is the other way to write one.
 """
 
 import importlib
@@ -38,33 +38,12 @@ from bwbayes.model.registry import HYSTERESIS, build_part
 from tests.app import small
 from tests.control.compiled import Compiled
 from tests.programs import needs
+from tests.test_contributing import example
 
 HERE = "tests.test_outside_operator"
 
 
 WIDTH = positive("width", "V", "u_s", "width of the loop", lambda ranges: 0.5 * ranges.voltage)
-
-
-@dataclass(frozen=True)
-class TanhLoop(RemembersExtrema):
-    """Branches w = w_r ± 2 Φ(|u − u_r| / 2) with Φ(x) = d x − α u_s tanh(x / u_s), um."""
-
-    @property
-    def parameters(self) -> tuple[Declaration, ...]:
-        """Slopes d and α, um/V, u_s, V, and the start."""
-        slope = positive("d", "um/V", "d", "slope", lambda ranges: 1.4 * ranges.slope)
-        held = positive("alpha", "um/V", "a", "slope held back", lambda ranges: 0.4 * ranges.slope)
-        return slope, held, WIDTH, INITIAL
-
-    def numbers(self, column: Values) -> FloatArray:
-        """Return d, α and u_s."""
-        return np.column_stack([column[name] for name in ("d", "alpha", "width")])
-
-    @staticmethod
-    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
-        """Return E = 2 Φ(|u − u_r| / 2)."""
-        half = np.abs(voltage - start) / 2
-        return 2 * (numbers[0] * half - numbers[1] * numbers[2] * np.tanh(half / numbers[2]))
 
 
 class BentStep(OneStateStep):
@@ -131,7 +110,7 @@ class Incomplete(RemembersExtrema):
         return (INITIAL,)
 
 
-class Forgetful(TanhLoop):
+class Forgetful(Bent):
     """Declares no state before the record."""
 
     @property
@@ -140,12 +119,12 @@ class Forgetful(TanhLoop):
         return super().parameters[:-1]
 
 
-class Unbounded(TanhLoop):
+class Unbounded(Bent):
     """Misspells another parameter in the bounds of one."""
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
-        """Those of the loop."""
+        """Those of the operator."""
         slope, *others = super().parameters
         return replace(slope, bounds=lambda earlier: (earlier["alhpa"], np.inf)), *others
 
@@ -171,17 +150,24 @@ walkers = 20
 [validation.held_out]
 window = [5.0, 6.0]
 """
+TANH_LOOP, BENT = "my_operator:TanhLoop", f"{HERE}:Bent"
 TRUTH = {
-    "TanhLoop": {"d": 0.9, "alpha": 0.3, "width": 40.0, "initial": 0.0},
-    "Bent": {"d": 0.9, "alpha": 0.2, "beta": 0.03, "bend": 2.0, "width": 40.0, "initial": 0.0},
+    TANH_LOOP: {"d": 0.9, "alpha": 12.0, "width": 40.0, "initial": 0.0},
+    BENT: {"d": 0.9, "alpha": 0.2, "beta": 0.03, "bend": 2.0, "width": 40.0, "initial": 0.0},
 }
 
 
+@pytest.fixture
+def _my_operator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_operator.py").write_text(example("my_operator.py"), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
 def record_of(kind: str) -> bwbayes.Record:
-    """Return a record that an operator of this module has made, with 0.3 um of sensor noise."""
+    """Return a record that an operator from outside has made, with 0.3 um of sensor noise."""
     time = np.arange(300) * 0.02
     voltage = 100 * np.exp(-0.3 * time) * np.sin(2 * np.pi * time)
-    operator = {"TanhLoop": TanhLoop(), "Bent": Bent()}[kind]
+    operator = build_part("model.hysteresis", kind, HYSTERESIS, {}, Operator)
     actuator = Actuator("none", "first", 0.02, operator, span=Span(-100.0, 100.0))
     theta = np.array([[*TRUTH[kind].values(), 1.0]])
     clean = actuator.displacement(theta, voltage, from_rest=True)[0]
@@ -192,9 +178,10 @@ def record_of(kind: str) -> bwbayes.Record:
 def config(folder: Path, kind: str) -> Config:
     """Write a record that such an operator has made, and return a config that fits it."""
     bwbayes.write_record(record_of(kind), folder / "record.csv")
-    return parse(CONFIG.replace("HYSTERESIS", f"{HERE}:{kind}"), "outside.toml")
+    return parse(CONFIG.replace("HYSTERESIS", kind), "outside.toml")
 
 
+@pytest.mark.usefixtures("_my_operator")
 def test_an_operator_from_outside_goes_all_the_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,7 +190,7 @@ def test_an_operator_from_outside_goes_all_the_way(
     The noise is from outside, too; what a run has kept of it is read again.
     Of three parameters, such a bound is missed by chance in one of 5,000 runs.
     """
-    kind = "TanhLoop"
+    kind = TANH_LOOP
     small.without_pictures(monkeypatch)
     stated = config(tmp_path, kind)
     noise = {"noise": f"{HERE}:OutsideNoise"}
@@ -218,12 +205,13 @@ def test_an_operator_from_outside_goes_all_the_way(
             assert abs(truth - one["mean"]) < 4 * one["sd"], name
     assert summary["validation"]["held_out"]["coverage"]["sensor"]["95"] > 0.7
     page = (folder.path / "report.html").read_text(encoding="utf-8")
-    assert "width of the loop" in page
-    assert f"{HERE}:{kind}" in folder.config.read_text(encoding="utf-8")
+    assert "held back" in page
+    assert kind in folder.config.read_text(encoding="utf-8")
     bands = bwbayes.open_run(folder.path).bands["held_out"]
     np.testing.assert_array_equal(bands.mean, result.bands["held_out"].mean)
 
 
+@pytest.mark.usefixtures("_my_operator")
 @pytest.mark.parametrize("kind", list(TRUTH))
 def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     """Of a problem whose truth may be stated in the operator's own parameters."""
@@ -237,20 +225,14 @@ def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     )
 
 
-def test_what_is_compiled_for_an_operator_is_looked_up_without_its_module(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("_my_operator")
+def test_what_is_compiled_for_an_operator_is_looked_up_without_its_module() -> None:
     """As of another folder: the index names what all operators have compiled."""
     typeof = pytest.importorskip("numba").typeof
     pytest.importorskip("bwbayes.model.compiled")  # knows the type
-    (tmp_path / "of_another_folder.py").write_text(
-        f"from {HERE} import TanhLoop\nclass Own(TanhLoop):\n    pass\n"
-    )
-    with monkeypatch.context() as patch:
-        patch.syspath_prepend(tmp_path)
-        known = typeof(importlib.import_module("of_another_folder").Own())
+    known = typeof(importlib.import_module("my_operator").TanhLoop())
     kept = pickle.dumps(known)
-    del sys.modules["of_another_folder"]
+    del sys.modules["my_operator"]
     assert pickle.loads(kept) == known
 
 
@@ -258,13 +240,13 @@ def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) 
     """Many models there and back to 1e-8 V, and the C file to 1e-12 of the range."""
     actuator = Actuator("none", "first", 0.02, Bent(), span=Span(-100.0, 100.0))
     spread = 1 + 0.02 * np.random.default_rng(2).uniform(-1, 1, (60, 1))
-    theta = spread * np.array([*TRUTH["Bent"].values(), 0.0])
-    voltage = record_of("Bent").voltage
+    theta = spread * np.array([*TRUTH[BENT].values(), 0.0])
+    voltage = record_of(BENT).voltage
     displacement = actuator.displacement(theta, voltage, from_rest=True)
     back = inverse(actuator, theta, displacement, from_rest=True)
     np.testing.assert_allclose(back, np.broadcast_to(voltage, back.shape), atol=1e-8)
     made_for = exported("bent", actuator, theta[0], Limits(-100.0, 100.0))
-    assert f"{HERE}:Bent" == made_for.numbers()["parts"]["hysteresis"]
+    assert BENT == made_for.numbers()["parts"]["hysteresis"]
     compiled = Compiled(made_for, tmp_path, needs("cc"))
     got = compiled.run("forward", voltage[0], voltage)
     np.testing.assert_allclose(got, displacement[0], atol=1e-12 * np.ptp(displacement[0]))
@@ -277,7 +259,7 @@ def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) 
         ("broken_module:Loop", "(ZeroDivisionError: division by zero); write module:Class"),
         (f"{HERE}:Stranger", "makes a Stranger, which is not a bwbayes.model.operator.Operator"),
         (f"{HERE}:Incomplete", "cannot be made: Can't instantiate abstract class Incomplete"),
-        (f"{HERE}:Forgetful", 'declares d, alpha, width; the last must be "initial"'),
+        (f"{HERE}:Forgetful", 'declares d, alpha, beta, bend, width; the last must be "initial"'),
     ],
 )
 def test_what_is_no_operator_is_one_clear_line(
@@ -285,7 +267,7 @@ def test_what_is_no_operator_is_one_clear_line(
 ) -> None:
     (tmp_path / "broken_module.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    bwbayes.write_record(record_of("TanhLoop"), tmp_path / "record.csv")
+    bwbayes.write_record(record_of(BENT), tmp_path / "record.csv")
     with pytest.raises(InputError, match=r"^model\.hysteresis: [^\n]*$") as refused:
         resolve_config(parse(CONFIG.replace("HYSTERESIS", name), "outside.toml"), tmp_path)
     assert said in str(refused.value)
@@ -300,7 +282,7 @@ def test_bounds_that_ask_for_what_no_part_declares_are_refused() -> None:
 
 def test_an_option_that_an_operator_from_outside_does_not_have_is_refused() -> None:
     with pytest.raises(InputError, match="has no option passive; remove it"):
-        build_part("model.hysteresis", f"{HERE}:TanhLoop", HYSTERESIS, {"passive": True}, Operator)
+        build_part("model.hysteresis", BENT, HYSTERESIS, {"passive": True}, Operator)
 
 
 def test_a_noise_or_filter_from_outside_is_checked_too() -> None:
