@@ -131,8 +131,13 @@ class Parameter:
 
     def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
         """Draw from its own prior between its bounds, whatever others are, (size,)."""
-        uniform = generator.uniform(*self.mass_between, size)
-        return np.asarray(self.distribution.frozen.ppf(uniform), dtype=np.float64)
+        return self.at(generator.uniform(size=size))
+
+    def at(self, probability: FloatArray) -> FloatArray:
+        """Return quantiles (any,) of its own prior between its bounds."""
+        low, high = self.mass_between
+        value = self.distribution.frozen.ppf(low + (high - low) * probability)
+        return np.asarray(value, dtype=np.float64)
 
 
 class JointPrior:

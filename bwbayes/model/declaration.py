@@ -338,6 +338,10 @@ class Declaration:
     at_rest
         Value of a parameter of one record where that starts from rest, and one of an event where
         that has not happened; None if this says nothing.
+    left
+        What an earlier drive leaves of a parameter of one record, (models,), in a record that was
+        not fitted: of the other columns (models,), the width of the displacements, um, and how far
+        through its course the drive is, 0 to 1 (models,). By default quantiles of the prior.
     unit_given
         The unit, where it depends on what is stated of other parameters.
     without_default
@@ -362,6 +366,7 @@ class Declaration:
     loop: bool = False
     aliases: tuple[str, ...] = ()
     at_rest: float | None = None
+    left: Callable[[Values, float, FloatArray], FloatArray] | None = None
     unit_given: Callable[[Mapping[str, float | Distribution]], str] | None = None
     without_default: str = ""
 

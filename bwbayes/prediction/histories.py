@@ -4,12 +4,13 @@ Most operators' states are one number, ``initial``. Those that remember extrema 
 earlier drives went leaves states of its own, and each such range is a history. The lead-in's
 likelihood of a history, and of the states in it, is computed on a grid that closes in on the states
 that it allows. There may be dozens of histories, which most draws rate alike: then a few draws have
-grids, and the others choose among their states, by importance.
+grids, and the others choose among their states, by importance. Stages may remember earlier drives
+as well, and what is in a play makes up for a state: then both are chosen together, by annealing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
@@ -23,6 +24,9 @@ from bwbayes.watching import Watch, part, parts, unwatched, watched
 
 # Draws that are asked about each of many histories.
 FEW = 50
+
+# Starts that each draw tries where they have several unknowns, and how often these move at a step.
+TRIES, MOVES = 8, 3
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,80 @@ def choose_histories(
     watch(1.0)
     histories = Histories(likelihoods, which)
     return histories, histories.with_states(theta, quantile), evidence
+
+
+def choose_together(
+    likelihoods: tuple[Likelihood, ...],
+    theta: FloatArray,
+    unknowns: Sequence[Callable[[FloatArray, FloatArray], FloatArray]],
+    generator: np.random.Generator,
+    watch: Watch = unwatched,
+) -> tuple[Histories, FloatArray, FloatArray]:
+    """Choose as :func:`choose_histories`, and together with them ``unknowns`` of stages.
+
+    Each of these puts quantiles of an unknown (draws,) into θ and returns it.
+
+    Every draw tries some starts, at first from what is known beforehand. The lead-in's likelihood L
+    counts by a power that rises from zero to one: a step from p to q weighs tries by L^(q - p), as
+    far as half of them count, and the mean weight is a factor of the draw's evidence; then tries
+    are drawn by weight, and move along differences of others by Metropolis's rule. (P. Del Moral,
+    A. Doucet and A. Jasra, J. R. Stat. Soc. B 68 (2006) 411-436; C. J. F. ter Braak, Stat. Comput.
+    16 (2006) 239-249.)
+    """
+    draws, single = len(theta), len(likelihoods) == 1
+    theta = np.repeat(theta, TRIES, axis=0)
+    every = np.arange(len(theta))
+    states = [States(likelihood, theta, single=single) for likelihood in likelihoods]
+
+    def started(scores: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Return histories and θ of normal scores (tries, 2 + unknowns)."""
+        history, quantile, *others = scipy.special.ndtr(scores.T)
+        which = np.minimum((len(states) * history).astype(np.int64), len(states) - 1)
+        start_theta = np.stack([each.at(quantile) for each in states])[which, every]
+        for put, probability in zip(unknowns, others, strict=True):
+            start_theta = put(start_theta, probability)
+        return which, start_theta
+
+    def density(scores: FloatArray) -> FloatArray:
+        which, start_theta = started(scores)
+        (values,) = Histories(likelihoods, which).each(
+            start_theta, lambda likelihood, rows: (likelihood.log_density(rows),)
+        )
+        return np.maximum(np.nan_to_num(values, nan=-np.inf, posinf=-np.inf), -1e300)
+
+    scores = generator.standard_normal((len(theta), 2 + len(unknowns)))
+    log, evidence, power = density(scores), np.zeros(draws), 0.0
+    while power < 1.0:
+        away = log.reshape(draws, TRIES)
+        best = np.max(away, axis=1, keepdims=True)
+        step, low, high = 1.0 - power, 0.0, 1.0 - power
+        for _ in range(50):
+            weight = np.exp(step * (away - best))
+            sums = weight.sum(axis=1)
+            many = np.mean(sums**2 / np.sum(weight**2, axis=1)) > TRIES / 2
+            if many and step == 1.0 - power:
+                break
+            low, high = (step, high) if many else (low, step)
+            step = (low + high) / 2
+        evidence += step * best[:, 0] + np.log(sums / TRIES)
+        total = np.cumsum(weight, axis=1)
+        level = (np.arange(TRIES) + generator.uniform(size=(draws, 1))) / TRIES * total[:, -1:]
+        kept = np.sum(total[:, np.newaxis] < level[..., np.newaxis], axis=2)
+        kept = (kept + TRIES * np.arange(draws)[:, np.newaxis]).ravel()
+        scores, log, power = scores[kept], log[kept], power + step
+        for _ in range(MOVES):
+            one, other = generator.permutation(every), generator.permutation(every)
+            length = generator.standard_normal((len(every), 1))
+            moved = scores + length * (scores[one] - scores[other])
+            log_moved = density(moved)
+            gain = power * (log_moved - log) + np.sum(scores**2 - moved**2, axis=1) / 2
+            taken = np.log(generator.uniform(size=len(every))) < gain
+            scores[taken], log[taken] = moved[taken], log_moved[taken]
+        watch(power)
+    which, start_theta = started(scores)
+    # Any of a draw's tries.
+    rows = TRIES * np.arange(draws) + generator.integers(TRIES, size=draws)
+    return Histories(likelihoods, which[rows]), start_theta[rows], evidence
 
 
 def _by_grids(

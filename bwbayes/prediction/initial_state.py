@@ -19,20 +19,27 @@ wide as ever.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood, LinearStart
+from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Inputs, Span
 from bwbayes.prediction.bands import LeadIn
-from bwbayes.prediction.histories import Histories, choose_histories, uniform
+from bwbayes.prediction.histories import (
+    Histories,
+    choose_histories,
+    choose_together,
+    uniform,
+)
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
@@ -185,12 +192,14 @@ def estimate_initial_states(
         offset_sd=training.extent if estimate_offset else 0.0,
         half_range=span.half,
     )
-    theta, redrawn = _of_new_record(posterior, theta, start, generator)
+    theta, unknowns = _of_new_record(posterior, theta, start)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
     likelihoods = tuple(
         replace(likelihood, actuator=replace(actuator, span=swept)) for swept in earlier
     )
     if window is None:
+        for put in unknowns:
+            theta = put(theta, generator.uniform(size=len(theta)))
         return _unseen(likelihoods, theta, generator, settled=start.settled)
     if estimate_offset:
         assert record.displacement is not None
@@ -201,13 +210,12 @@ def estimate_initial_states(
         typical = likelihood.table.actuator(np.mean(theta, axis=0)[np.newaxis])
         between = _between(likelihoods, typical)
         likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
-    histories, start_theta, evidence = choose_histories(
-        likelihoods, theta, generator, part(watch, 0.0, 0.5)
+    watch_start = part(watch, 0.0, 0.5)
+    histories, start_theta, evidence = (
+        choose_together(likelihoods, theta, unknowns, generator, watch_start)
+        if unknowns
+        else choose_histories(likelihoods, theta, generator, watch_start)
     )
-    # The stages' unknown parameters and the histories are chosen in turns.
-    for _ in range(4 if redrawn else 0):
-        theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
-        histories, start_theta, evidence = choose_histories(likelihoods, theta, generator)
     rows = resample(evidence, generator)
     theta, start_theta = theta[rows], start_theta[rows]
     histories = replace(histories, which=histories.which[rows])
@@ -219,56 +227,37 @@ def estimate_initial_states(
 
 
 def _of_new_record(
-    posterior: Posterior,
-    theta: FloatArray,
-    start: InitialConditions,
-    generator: np.random.Generator,
-) -> tuple[FloatArray, list[str]]:
-    """Give draws θ what stages do not know of a record that was not fitted, from its prior.
+    posterior: Posterior, theta: FloatArray, start: InitialConditions
+) -> tuple[FloatArray, list[Callable[[FloatArray, FloatArray], FloatArray]]]:
+    """Give draws θ what stages know of a record that was not fitted.
 
-    An event of the training record does not happen again. Beside θ come the names of the parameters
-    that were drawn.
+    An event of the training record does not happen again. Beside θ come functions that put
+    quantiles (draws,) of what is not known into it.
     """
-    table, redrawn = posterior.single_record.table, list[str]()
+    alone, unknowns = posterior.single_record, []
     for parameter in posterior.prior.parameters:
         declared, name = parameter.declared, parameter.name
         stands = declared.at_rest if declared.scope == "event" or start.from_rest else None
         if name in ("initial", "offset") or declared.scope == "actuator":
             continue
         if stands is not None:
-            theta = table.replaced(theta, name, np.full(len(theta), stands))
+            theta = alone.table.replaced(theta, name, np.full(len(theta), stands))
         elif parameter.fixed is None:
-            theta = table.replaced(theta, name, parameter.draw(generator, len(theta)))
-            redrawn.append(name)
-    return theta, redrawn
+            unknowns.append(partial(_put_left, alone, parameter))
+    return theta, unknowns
 
 
-def _choose_by_lead_in(
-    posterior: Posterior,
-    histories: Histories,
-    theta: FloatArray,
-    names: list[str],
-    generator: np.random.Generator,
-    tries: int = 16,
+def _put_left(
+    alone: Likelihood, parameter: Parameter, theta: FloatArray, probability: FloatArray
 ) -> FloatArray:
-    """Let the lead-in choose every draw's unknowns of stages, of so many from their prior."""
-    if not names:
-        return theta
-    table, parameters = posterior.single_record.table, posterior.prior.parameters
-    candidates = [theta]
-    for _ in range(tries - 1):
-        other = theta
-        for parameter in (p for p in parameters if p.name in names):
-            other = table.replaced(other, parameter.name, parameter.draw(generator, len(theta)))
-        candidates.append(other)
-    densities = [
-        histories.each(other, lambda likelihood, rows: (likelihood.log_density(rows),))[0]
-        for other in candidates
-    ]
-    density = np.nan_to_num(np.stack(densities), nan=-np.inf, posinf=-np.inf)
-    weight = np.cumsum(np.exp(density - np.maximum(density.max(axis=0), -1e300)), axis=0)
-    chosen = np.sum(weight < uniform(generator, len(theta)) * weight[-1], axis=0)
-    return np.stack(candidates)[chosen, np.arange(len(theta))]
+    """Return θ with quantiles (draws,) of what earlier drives leave of a parameter."""
+    left = parameter.declared.left
+    value = (
+        parameter.at(probability)
+        if left is None
+        else left(alone.table.columns(theta), alone.extent, probability)
+    )
+    return alone.table.replaced(theta, parameter.name, value)
 
 
 def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:

@@ -17,6 +17,7 @@ quite Student's. It also makes 200 records for every operator, whose 95% band mu
 97%.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import product
 from unittest.mock import patch
@@ -34,7 +35,9 @@ from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import LEVELS, Bands
+from bwbayes.prediction.histories import Histories, choose_histories
 from bwbayes.prediction.initial_state import estimate_initial_states
+from bwbayes.watching import Watch
 from tests.measured import keep
 from tests.prediction.moving import (
     RATE,
@@ -104,10 +107,23 @@ def test_bands_cover_records_behind_a_play_that_begins_anywhere() -> None:
     limit = stats.t.isf(stats.t.sf(QUICK_LIMIT, QUICK - 1), QUICK // 2 - 1)
     assert {} == {level: t for level, t in off(every).items() if abs(t) > limit}
     assert np.mean(covered(every, 95)) > 0.9
-    with patch.object(initial_state, "_choose_by_lead_in", lambda *asked: asked[2]):
-        unasked = studied(case, len(every), seed=1)
-    wide, narrow = (np.mean([width(b, "sensor") for b in bands]) for bands in (unasked, every))
+    with patch.object(initial_state, "choose_together", unasked):
+        anywhere = studied(case, len(every), seed=1)
+    wide, narrow = (np.mean([width(b, "sensor") for b in bands]) for bands in (anywhere, every))
     assert narrow < 0.97 * wide
+
+
+def unasked(
+    likelihoods: tuple[Likelihood, ...],
+    theta: FloatArray,
+    unknowns: Iterable[Callable[[FloatArray, FloatArray], FloatArray]],
+    generator: np.random.Generator,
+    watch: Watch,  # noqa: ARG001
+) -> tuple[Histories, FloatArray, FloatArray]:
+    """Choose histories, and take the unknowns of stages as they are drawn beforehand."""
+    for put in unknowns:
+        theta = put(theta, generator.uniform(size=len(theta)))
+    return choose_histories(likelihoods, theta, generator)
 
 
 @pytest.mark.slow

@@ -21,6 +21,16 @@ from bwbayes.model.declaration import Declaration, Distribution, Values, lognorm
 from bwbayes.model.stage import Side, Stage, Timing
 
 
+def _after_a_swing(column: Values, extent: float, part: FloatArray) -> FloatArray:
+    """Return where in its play a swing as wide as an extent, um, leaves y, at a part of its period.
+
+    On its way up from the lowest point y is at the play's upper end at first, then at the lower.
+    """
+    way = extent * (1 - np.cos(2 * np.pi * part)) / 2
+    up = np.maximum(1 - way / column["backlash"], -1.0)
+    return np.where(part < 0.5, up, -up)
+
+
 class Backlash(Stage):
     """Backlash: y stays where it is until x is farther than b from it, |x − y| ≤ b.
 
@@ -56,6 +66,7 @@ class Backlash(Stage):
             stated_bounds="-1 <= backlash_start <= 1",
             scope="record",
             at_rest=0.0,
+            left=_after_a_swing,
         ),
     )
 
