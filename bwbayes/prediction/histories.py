@@ -22,6 +22,9 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.inputs import Span
 from bwbayes.watching import Watch, part, parts, unwatched, watched
 
+Put = Callable[[FloatArray, FloatArray], FloatArray]
+"""Puts quantiles of an unknown (draws,) into θ (draws, parameters), and returns it."""
+
 # Draws that are asked about each of many histories.
 FEW = 50
 
@@ -149,13 +152,11 @@ def choose_histories(
 def choose_together(
     likelihoods: tuple[Likelihood, ...],
     theta: FloatArray,
-    unknowns: Sequence[Callable[[FloatArray, FloatArray], FloatArray]],
+    unknowns: Sequence[Put],
     generator: np.random.Generator,
     watch: Watch = unwatched,
 ) -> tuple[Histories, FloatArray, FloatArray]:
     """Choose as :func:`choose_histories`, and together with them ``unknowns`` of stages.
-
-    Each of these puts quantiles of an unknown (draws,) into θ and returns it.
 
     Every draw tries some starts, at first from what is known beforehand. The lead-in's likelihood L
     counts by a power that rises from zero to one: a step from p to q weighs tries by L^(q - p), as

@@ -19,7 +19,7 @@ wide as ever.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -36,6 +36,7 @@ from bwbayes.model.inputs import Inputs, Span
 from bwbayes.prediction.bands import LeadIn
 from bwbayes.prediction.histories import (
     Histories,
+    Put,
     choose_histories,
     choose_together,
     uniform,
@@ -228,13 +229,12 @@ def estimate_initial_states(
 
 def _of_new_record(
     posterior: Posterior, theta: FloatArray, start: InitialConditions
-) -> tuple[FloatArray, list[Callable[[FloatArray, FloatArray], FloatArray]]]:
+) -> tuple[FloatArray, list[Put]]:
     """Give draws θ what stages know of a record that was not fitted.
 
-    An event of the training record does not happen again. Beside θ come functions that put
-    quantiles (draws,) of what is not known into it.
+    An event of the training record does not happen again. Beside θ comes what is not known.
     """
-    alone, unknowns = posterior.single_record, []
+    alone, unknowns = posterior.single_record, list[Put]()
     for parameter in posterior.prior.parameters:
         declared, name = parameter.declared, parameter.name
         stands = declared.at_rest if declared.scope == "event" or start.from_rest else None

@@ -17,7 +17,7 @@ quite Student's. It also makes 200 records for every operator, whose 95% band mu
 97%.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import product
 from unittest.mock import patch
@@ -35,7 +35,7 @@ from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import LEVELS, Bands
-from bwbayes.prediction.histories import Histories, choose_histories
+from bwbayes.prediction.histories import Histories, Put, choose_histories
 from bwbayes.prediction.initial_state import estimate_initial_states
 from bwbayes.watching import Watch
 from tests.measured import keep
@@ -116,7 +116,7 @@ def test_bands_cover_records_behind_a_play_that_begins_anywhere() -> None:
 def unasked(
     likelihoods: tuple[Likelihood, ...],
     theta: FloatArray,
-    unknowns: Iterable[Callable[[FloatArray, FloatArray], FloatArray]],
+    unknowns: Iterable[Put],
     generator: np.random.Generator,
     watch: Watch,  # noqa: ARG001
 ) -> tuple[Histories, FloatArray, FloatArray]:
