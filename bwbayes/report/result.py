@@ -44,8 +44,7 @@ from bwbayes.errors import InputError, Renamed, refuse_unwritable
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import Bands, Scores
 from bwbayes.prediction.budget import Budget
-from bwbayes.prediction.loops import Loops
-from bwbayes.prediction.steps import StepResponse
+from bwbayes.prediction.loops import Loops, StepResponse
 from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.record.io.formats import draft_of
 from bwbayes.record.record import Record

@@ -21,8 +21,7 @@ from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.prediction.bands import LEVELS, Bands, Scores
 from bwbayes.prediction.budget import TYPES, Budget
-from bwbayes.prediction.loops import MEASURES, Estimate, Loops
-from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
+from bwbayes.prediction.loops import MEASURES, STEP_MEASURES, Estimate, Loops, StepResponse
 from bwbayes.report.calibration import outcome
 from bwbayes.report.figures import Pictures, pictures as all_pictures
 from bwbayes.report.report import (

@@ -13,9 +13,8 @@ from scipy.signal import lfilter
 from bwbayes.app.config.config import parse
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.linearization import STEP, gradient_and_hessian, value_and_jacobian
-from bwbayes.inference.map_estimate import MAPEstimate, fit, mode_weights
+from bwbayes.inference.map_estimate import LeastSquares, MAPEstimate, fit, mode_weights
 from bwbayes.inference.mode_finding import Target, climb, refine
 from bwbayes.inference.posterior import Posterior
 from tests.diagnosis.plants import bench

@@ -19,9 +19,8 @@ from bwbayes.diagnosis.validation import ValidationContext, validate_bands
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import InitialConditions
-from bwbayes.prediction import correction as module
-from bwbayes.prediction.bands import Bands, LeadIn
-from bwbayes.prediction.correction import correct, residual_memory
+from bwbayes.prediction import bands as module
+from bwbayes.prediction.bands import Bands, LeadIn, correct, residual_memory
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.diagnosis import plants

@@ -10,9 +10,8 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Span
 from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.prediction.loops import Estimate
+from bwbayes.prediction.loops import Estimate, Step, measure_step, measure_steps, step_of
 from bwbayes.prediction.prediction import forecast
-from bwbayes.prediction.steps import Step, measure_step, measure_steps, step_of
 from bwbayes.record.record import Record
 from bwbayes.record.waveforms import signal
 from tests.inference.problems import decaying_sine, posterior_of

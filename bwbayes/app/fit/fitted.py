@@ -60,8 +60,7 @@ if TYPE_CHECKING:
     from bwbayes.inference.study import Study
     from bwbayes.prediction.bands import Bands
     from bwbayes.prediction.budget import Budget
-    from bwbayes.prediction.loops import Loops
-    from bwbayes.prediction.steps import StepResponse
+    from bwbayes.prediction.loops import Loops, StepResponse
     from bwbayes.quantities import Quantities
     from bwbayes.report.report import Report
     from bwbayes.report.result import Result
@@ -280,7 +279,7 @@ class Run(Shown):
     @RunStage
     def step_responses(self, _: Watch) -> dict[str, StepResponse]:
         """Return the responses to the steps among what was predicted, by name."""
-        from bwbayes.prediction.steps import measure_steps
+        from bwbayes.prediction.loops import measure_steps
 
         records = self.study.others
         if len(self.study.records) > 1:

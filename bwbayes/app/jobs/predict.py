@@ -40,8 +40,7 @@ from bwbayes.inference.study import InitialConditions, Study, Validation
 from bwbayes.model.spec import ModelSpec
 
 # The fields that Prediction inherits are read where it stands.
-from bwbayes.prediction.bands import Bands, Correction, Kind, LeadIn  # noqa: F401
-from bwbayes.prediction.correction import correct
+from bwbayes.prediction.bands import Bands, Correction, Kind, LeadIn, correct  # noqa: F401
 from bwbayes.prediction.prediction import (
     continued,
     forecast,

@@ -15,10 +15,15 @@ import numpy as np
 from numba.extending import overload
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.compiled import pinned
-from bwbayes.inference.compiled.extrema import Branches, along_branches
 from bwbayes.inference.compiled.lanes import LANES, inner, repeat_last
-from bwbayes.inference.compiled.relaxing import Relaxing, relaxing, steps_moved
+from bwbayes.inference.compiled.operators import (
+    Branches,
+    Relaxing,
+    along_branches,
+    pinned_drive,
+    relaxing,
+    steps_moved,
+)
 from bwbayes.model.compiled import formula
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import HysteresisStep, Operator
@@ -89,7 +94,7 @@ def prepared(
 def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
     """Return a function that makes the drive of a whole piece, like ``advance`` of the class."""
     integrated = type(operator) in (JilesAtherton, DomainWall)
-    return pinned.drive if integrated else type(operator).advance
+    return pinned_drive if integrated else type(operator).advance
 
 
 def drive_of(owner: Any, models: Any, group: Any, voltage: Any, first: Any, out: Any) -> None:

@@ -19,8 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.consistency import Consistency
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.prediction.bands import LEVELS, Bands
-from bwbayes.prediction.loops import Loops
-from bwbayes.prediction.steps import CREEP_FROM, StepResponse
+from bwbayes.prediction.loops import CREEP_FROM, Loops, StepResponse
 from bwbayes.report.figures import style
 from bwbayes.report.result import Result
 
