@@ -159,6 +159,9 @@ CLAIMS: dict[str, Quoted] = {
     ),
     "... the least covered of all plans, %": Quoted(["min 100 untried/worst/*"]),
     "... width of bands of fast drives, over that without": Quoted(["untried/wider"]),
+    "... after a fit of the wrong model, %": Quoted(
+        ["100 corrected bands/corrected covers"], ["corrected bands/corrected"]
+    ),
     "Every 2nd, 5th and 20th sample: smallest p of the differences": Quoted(
         ["min every k-th sample*/smallest p"], ["min every k-th sample*/p of the family", *THINNED]
     ),

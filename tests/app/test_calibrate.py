@@ -10,7 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.random import default_rng
 
 import bwbayes as bw
 from bwbayes.app.config.config import parse
@@ -21,11 +23,14 @@ from bwbayes.calibration.calibration import CalibrationSetup
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.record.waveforms import Decay, Sine, Waveform
 from bwbayes.sampling.plan import SamplingPlan
 from tests.app import small
 from tests.app.conftest import Type
 from tests.app.specimens import MODEL
 from tests.app.steps import Steps
+from tests.measured import keep
 
 # A replicate takes a fraction of a second.
 TEXT = (
@@ -309,3 +314,21 @@ def test_what_no_replicate_can_use_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="hardly any draw has"):
         begun(tmp_path / "a", text=TEXT.replace(old, new))
     assert [] == list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
+def test_intervals_of_a_run_are_right_for_its_record() -> None:
+    """Of 300 readings of the stand, in 200 replicates; of the mean over parameters the error is 1%.
+
+    Parameters share their record, and so most of what luck does in it.
+    """
+    stand = VirtualTestStand(sample_rate=50.0)
+    record = stand.run(Waveform(Sine(100.0, 1.0), 6.0, decay=Decay(0.0, 0.1)), default_rng(1))
+    fit = bw.fit(record, dynamics="lag", search="none", progress=False, seed=1)
+    found = fit.calibrate(replicates=200, progress=False)
+    cover = {name: statistic.covered[95] for name, statistic in found.statistics.items()}
+    unconverged = len(found.unconverged)
+    keep("calibrated run", {"cover": cover, "replicates": 200, "unconverged": unconverged})
+    assert found.passed, found.failures
+    assert 0.93 < float(np.mean([*cover.values()])) < 0.97
