@@ -172,7 +172,8 @@ def choose_together(
 
     def started(scores: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return histories and θ of normal scores (tries, 2 + unknowns)."""
-        history, quantile, *others = scipy.special.ndtr(scores.T)
+        # Farther out a probability is one to rounding, and its quantile infinite.
+        history, quantile, *others = scipy.special.ndtr(np.clip(scores.T, -8.0, 8.0))
         which = np.minimum((len(states) * history).astype(np.int64), len(states) - 1)
         start_theta = np.stack([each.at(quantile) for each in states])[which, every]
         for put, probability in zip(unknowns, others, strict=True):
