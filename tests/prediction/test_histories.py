@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bwbayes.arrays import FloatArray
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Span
 from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.model.stages.lags import Delay
 from bwbayes.prediction import initial_state
-from bwbayes.prediction.histories import States, choose_histories
+from bwbayes.prediction.histories import States, choose_histories, choose_together
 from bwbayes.prediction.initial_state import estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
@@ -205,3 +206,24 @@ def test_draws_at_the_edge_of_the_domain_have_a_start() -> None:
     record = Record(voltage, 0.5 * voltage, interval=1 / RATE)
     begun = estimate_initial_states(posterior, theta, record, start, np.random.default_rng(1))
     assert (begun.offset_sd > 0).all()
+
+
+def test_unknowns_are_chosen_among_possible_ones() -> None:
+    """However far a try moves, its quantile is neither zero nor one, where a prior has no end."""
+    likelihoods = estimate_initial_states(
+        POSTERIOR, DRAWS, record_after(30.0), InitialConditions(), np.random.default_rng(2)
+    ).histories.likelihoods
+    asked = []
+
+    def put(theta: FloatArray, probability: FloatArray) -> FloatArray:
+        asked.append(probability)
+        return theta
+
+    _, start_theta, evidence = choose_together(
+        likelihoods[:2], DRAWS, [put], np.random.default_rng(3)
+    )
+    assert start_theta.shape == DRAWS.shape
+    assert np.isfinite(evidence).all()
+    every = np.concatenate(asked)
+    assert 0 < every.min() < 1e-12
+    assert 1 - 1e-12 < every.max() < 1
