@@ -6,9 +6,9 @@ are longer on one side, and an offset is the less certain the larger the discrep
 ellipsoids do not cover such a shape, least of all with few draws. Three maps straighten it, one
 after the other. A record may determine hardly more than the total of two sds, or of two lags in a
 row: the ridge then has two legs at a right angle, which a :class:`TotalRatioMap` puts in line. A
-:class:`SkewMap` makes both tails of each coordinate alike. A :class:`QuadraticMap` takes the part
-of each coordinate that those before it leave open, longest first, and lets it bend quadratically
-with them, and widen. Each map returns how much it stretches, so that a density of the straight
+:class:`SkewMap` makes both tails of each coordinate alike. A :class:`PolynomialMap` takes the part
+of each coordinate that those before it leave open, longest first, and lets it bend with them, and
+widen. Each map returns how much it stretches, so that a density of the straight
 coordinates gives one of the bent ones.
 """
 
@@ -18,6 +18,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
+from typing import NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -28,18 +30,22 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.model.stages.lags import TIME_CONSTANTS
 from bwbayes.sampling.secant import SecantMap
 
-LONGEST = 12  # only the longest coordinates bend others
+# A polynomial has so many terms at most, of the longest coordinates, and of this degree at most.
+TERMS, LONGEST, DEGREE = 128, 12, 4
 FARTHEST = 5.0  # sds beyond which a bend continues straight: no draws show it there
 
 
 @dataclass(frozen=True)
-class QuadraticMap:
+class PolynomialMap:
     """The map from straight coordinates z to bent ones x.
 
-    With c = clip(z) to five sds, and the coordinates ordered so that each next one is the one that
-    those before it leave open most,
+    With u = F⁻¹(x − μ), c = clip(u) to five sds, and the coordinates ordered so that each next one
+    is the one that those before it leave open most,
 
-        yⱼ = zⱼ exp(Σ_{i < j} sᵢⱼ cᵢ) + Σ_{i ≤ k < j} bᵢₖⱼ (cᵢ cₖ − δᵢₖ),   x = μ + y Fᵀ.
+        zⱼ = (uⱼ − Σₜ bₜⱼ Π c) exp(−Σ_{i < j} sᵢⱼ cᵢ),
+
+    where the product of term t is of up to four cᵢ with i < j. What a record determines well is a
+    smooth function of the parameters, of which this is the Taylor series.
 
     Parameters
     ----------
@@ -48,25 +54,29 @@ class QuadraticMap:
     factor
         F, (free, free), F Fᵀ the covariance of the draws; lower triangular in the order of the
         coordinates.
+    terms
+        The coordinates that each term multiplies, (terms, 4); -1 where it has fewer. Terms are in
+        the order of their last coordinate.
     bends
-        bᵢₖⱼ, (pairs, free), zero unless i ≤ k < j; the pairs (0, 0), (0, 1), (1, 1), (0, 2), … of
-        the first twelve coordinates.
+        bₜⱼ, (terms, free), zero unless all coordinates of t come before j.
     scales
-        sᵢⱼ, (twelve at most, free), zero unless i < j; None if nothing widens.
+        sᵢⱼ, (twelve at most, free), zero unless i < j.
     """
 
     center: FloatArray
     factor: FloatArray
+    terms: IntArray
     bends: FloatArray
-    scales: FloatArray | None = None
+    scales: FloatArray
 
     @classmethod
-    def fitted(cls, draws: FloatArray) -> QuadraticMap | None:
+    def fitted(cls, draws: FloatArray) -> PolynomialMap | None:
         """Fit to draws (count, free), or 20,000 of them; None if not bent and of one width.
 
-        A coordinate bends if the bend explains a tenth of its variance, by least squares and with
-        as many others as leave fifty draws to a coefficient. It widens if the width makes the draws
-        more probable, by a hundredth of a nat each.
+        A coordinate bends with the largest terms, where u is as long as the draws in units of x, of
+        the number with which each half of the draws predicts the other best by least squares, but
+        no more than leave fifty draws to a coefficient. It bends, and it widens, only if that makes
+        the draws more probable by a hundredth of a nat each.
 
         Raises
         ------
@@ -80,26 +90,28 @@ class QuadraticMap:
         triangle, order = scipy.linalg.qr(draws - center, mode="r", pivoting=True)
         factor = np.empty((free, free))
         factor[order] = triangle[:free].T / np.sqrt(count)
-        z = np.linalg.solve(factor, (draws - center).T).T
-        longest = min(free, LONGEST)
-        bends, scales = np.zeros((longest * (longest + 1) // 2, free)), np.zeros((longest, free))
-        products = np.empty((count, 0))
+        u = np.linalg.solve(factor, (draws - center).T).T
+        near = _near(u)
+        lengths = np.abs(np.diagonal(triangle))[: near.shape[1] - 1] / np.sqrt(count)
+        terms = _largest_terms(lengths, min(count // 50, TERMS))
+        products = _products(near, terms)
+        halves = [
+            _Regression.of(products[rows], u[rows])
+            for rows in (slice(count // 2), slice(count // 2, None))
+        ]
+        bends, scales = np.zeros((len(terms), free)), np.zeros((len(lengths), free))
         for j in range(1, free):
-            if j <= LONGEST and (products.shape[1] + j) * 50 <= count:
-                products = np.concatenate([products, _products(z, j - 1)], axis=1)
-            terms = products.shape[1]
-            # Shrink each coefficient to zero, with the weight of a thousandth of all draws.
-            information = products.T @ products / count + 1e-3 * np.eye(terms)
-            coefficients = np.linalg.solve(information, products.T @ z[:, j] / count)
-            whitened = z[:, j] - products @ coefficients
-            if np.var(whitened) < 0.9 * np.var(z[:, j]):
-                z[:, j], bends[:terms, j] = whitened, coefficients
-            near = np.clip(z[:, : min(j, LONGEST)], -FARTHEST, FARTHEST)
-            scale = scales[: near.shape[1], j] = _fit_log_scales(near, z[:, j])
-            z[:, j] *= np.exp(-near @ scale)
+            known = np.flatnonzero(terms[:, -1] < j)
+            if used := _best_size(halves, known, j):
+                known = known[:used]
+                bends[known, j] = (halves[0] + halves[1]).coefficients(known, j)
+                u[:, j] -= products[:, known] @ bends[known, j]
+            others = min(j, len(lengths))
+            scales[:others, j] = _fit_log_scales(near[:, :others], u[:, j])
         if not bends.any() and not scales.any():
             return None
-        return cls(center, factor, bends, scales if scales.any() else None)
+        order = np.argsort(terms[:, -1], kind="stable")
+        return cls(center, factor, terms[order], bends[order], scales)
 
     @cached_property
     def _inverse(self) -> FloatArray:
@@ -110,54 +122,40 @@ class QuadraticMap:
         """The logarithm of |det F|."""
         return float(np.linalg.slogdet(self.factor)[1])
 
-    @cached_property
-    def _pairs(self) -> tuple[IntArray, IntArray]:
-        """The indices i and k of the rows of ``bends``."""
-        k, i = np.tril_indices(min(self.center.size, LONGEST))
-        return i, k
-
-    @cached_property
-    def _curved(self) -> tuple[tuple[int, int, int], ...]:
-        """Coordinates that bend or widen, with the numbers of bending pairs and widening others."""
-        scales = np.zeros((1, self.center.size)) if self.scales is None else self.scales
-        ends = [
-            [int(np.max(np.flatnonzero(column), initial=-1)) + 1 for column in table.T]
-            for table in (self.bends, scales)
-        ]
-        numbered = zip(range(self.center.size), *ends, strict=True)
-        return tuple((j, pairs, others) for j, pairs, others in numbered if pairs or others)
-
     def inverse(self, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x (..., free) of z (..., free), and log |∂x/∂z| (...)."""
-        i, k = self._pairs
-        near = np.clip(whitened[..., :LONGEST], -FARTHEST, FARTHEST)
-        y, log_slope = whitened, np.full(whitened.shape[:-1], self._log_volume)
-        if self.scales is not None:
-            widths = near @ self.scales
-            y, log_slope = y * np.exp(widths), log_slope + np.sum(widths, axis=-1)
-        if self.bends.any():
-            y = y + (near[..., i] * near[..., k] - (i == k)) @ self.bends
-        return self.center + y @ self.factor.T, log_slope
+        z = whitened.reshape(-1, self.center.size)
+        u, longest = np.empty_like(z), len(self.scales)
+        near, bent = np.ones((len(z), longest + 1)), np.zeros(z.shape)
+        ends = np.searchsorted(self.terms[:, -1], np.arange(-1, longest), side="right")
+        begin, log_slope = 0, np.full(len(z), self._log_volume)
+        for j in range(z.shape[1]):
+            if j <= longest:  # the terms of those before it are known
+                rows, begin = slice(begin, ends[j]), ends[j]
+                bent += _products(near, self.terms[rows]) @ self.bends[rows]
+            width = self._widths(near[:, : min(j, longest)], j)
+            u[:, j] = z[:, j] * np.exp(width) + bent[:, j]
+            log_slope += width
+            if j < longest:
+                near[:, j] = np.clip(u[:, j], -FARTHEST, FARTHEST)
+        x = self.center + u @ self.factor.T
+        return x.reshape(whitened.shape), log_slope.reshape(whitened.shape[:-1])
+
+    def _widths(self, near: FloatArray, j: int | slice = slice(None)) -> FloatArray:
+        """Return Σ sᵢⱼ cᵢ, within the five that draws may show, of the coordinates before j."""
+        return np.clip(near @ self.scales[: near.shape[1], j], -FARTHEST, FARTHEST)
 
     def forward(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return z (..., free) of x (..., free), and log |∂z/∂x| (...)."""
         z = ((bent - self.center) @ self._inverse).reshape(-1, self.center.size)
-        log_slope = np.full(len(z), -self._log_volume)
+        log_slope = np.empty(len(z))
         for start in range(0, len(z), 4096):  # products take memory
             chunk = z[start : start + 4096]
-            products = np.empty((len(chunk), 0))
-            last = 0
-            for j, end, others in self._curved:
-                while products.shape[1] < end:
-                    products = np.concatenate([products, _products(chunk, last)], axis=1)
-                    last += 1
-                if end:
-                    chunk[:, j] -= products[:, :end] @ self.bends[:end, j]
-                if self.scales is not None and others:
-                    near = np.clip(chunk[:, :others], -FARTHEST, FARTHEST)
-                    width = near @ self.scales[:others, j]
-                    chunk[:, j] *= np.exp(-width)
-                    log_slope[start : start + 4096] -= width
+            near = _near(chunk)
+            widths = self._widths(near[:, :-1])
+            chunk -= _products(near, self.terms) @ self.bends
+            chunk *= np.exp(-widths)
+            log_slope[start : start + 4096] = -self._log_volume - np.sum(widths, axis=1)
         return z.reshape(bent.shape), log_slope.reshape(bent.shape[:-1])
 
 
@@ -307,7 +305,7 @@ class TotalRatioMap:
         return slopes
 
 
-type Map = TotalRatioMap | SkewMap | QuadraticMap | SecantMap
+type Map = TotalRatioMap | SkewMap | PolynomialMap | SecantMap
 
 
 def fit_maps(draws: FloatArray) -> list[Map]:
@@ -319,7 +317,7 @@ def fit_maps(draws: FloatArray) -> list[Map]:
     candidates: list[tuple[float, list[Map]]] = []
     without: list[Map] = []
     for skews in (without, [*without, SkewMap.fitted(draws)]):
-        bend = QuadraticMap.fitted(apply_maps(skews, draws)[0])
+        bend = PolynomialMap.fitted(apply_maps(skews, draws)[0])
         maps: list[Map] = [*skews, *([] if bend is None else [bend])]
         whitened, log_slope = apply_maps(maps, draws)
         _, log_volume = np.linalg.slogdet(np.atleast_2d(np.cov(whitened, rowvar=False)))
@@ -352,12 +350,72 @@ def subsample(draws: FloatArray, count: int) -> FloatArray:
     return draws[:: -(-len(draws) // count) | 1]
 
 
-def _products(z: FloatArray, last: int) -> FloatArray:
-    """Return cᵢ cₖ − δᵢₖ (count, k + 1) for one k, the ``last``, and every i up to it."""
-    near = np.clip(z[:, : last + 1], -FARTHEST, FARTHEST)
-    products: FloatArray = near * near[:, -1:]
-    products[:, -1] -= 1.0
-    return products
+def _near(u: FloatArray) -> FloatArray:
+    """Return c (count, twelve at most) of u (count, free), and a column of ones at the end."""
+    near = np.clip(u[:, :LONGEST], -FARTHEST, FARTHEST)
+    return np.column_stack([near, np.ones(len(u))])
+
+
+def _largest_terms(lengths: FloatArray, count: int) -> IntArray:
+    """Return ``count`` terms (count, 4), largest first, of coordinates that have these lengths."""
+    terms = np.array([*combinations_with_replacement(range(-1, len(lengths)), DEGREE)])
+    sizes = np.append(np.minimum(lengths, 1.0), 1.0)[terms].prod(axis=1)
+    return terms[np.argsort(-sizes, kind="stable")[:count]]
+
+
+class _Regression(NamedTuple):
+    """Sums over draws for least squares of coordinates by terms: of terms, of both, of squares."""
+
+    terms: FloatArray
+    responses: FloatArray
+    squares: FloatArray
+
+    @classmethod
+    def of(cls, products: FloatArray, u: FloatArray) -> Self:
+        """Return the sums of terms (count, terms) and coordinates (count, free)."""
+        return cls(products.T @ products, products.T @ u, np.sum(u**2, axis=0))
+
+    def __add__(self, other: _Regression) -> _Regression:  # type: ignore[override]
+        return _Regression(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def coefficients(self, known: IntArray, j: int) -> FloatArray:
+        """Return the coefficients of the ``known`` terms for coordinate j.
+
+        Each is shrunk to zero, with the weight of a thousandth of all draws.
+        """
+        information = self.terms[np.ix_(known, known)]
+        information = information + 1e-3 * np.diag(np.diagonal(information))
+        coefficients: FloatArray = np.linalg.solve(information, self.responses[known, j])
+        return coefficients
+
+    def error(self, known: IntArray, coefficients: FloatArray, j: int) -> float:
+        """Return the sum of squares that these coefficients leave."""
+        explained = self.terms[np.ix_(known, known)] @ coefficients - 2 * self.responses[known, j]
+        return float(self.squares[j] + coefficients @ explained)
+
+
+def _best_size(halves: Sequence[_Regression], known: IntArray, j: int) -> int:
+    """Return how many of the ``known`` terms predict coordinate j of each half from the other."""
+    without = np.exp(-0.02) * sum(half.squares[j] for half in halves), 0
+    errors = [
+        (
+            sum(
+                other.error(known[:size], half.coefficients(known[:size], j), j)
+                for half, other in (halves, halves[::-1])
+            ),
+            size,
+        )
+        for size in (*2 ** np.arange(int(np.log2(max(known.size, 1)))), known.size)
+    ]
+    return int(min([without, *errors])[1])
+
+
+def _products(near: FloatArray, terms: IntArray) -> FloatArray:
+    """Return the terms (count, terms) of :func:`_near` coordinates."""
+    product = near[:, terms[:, 0]]
+    for column in terms.T[1:]:
+        product = product * near[:, column]
+    return product
 
 
 def _fit_log_scales(near: FloatArray, values: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import (
     Map,
-    QuadraticMap,
+    PolynomialMap,
     SkewMap,
     TotalRatioMap,
     apply_maps,
@@ -38,7 +38,7 @@ _MAPS: dict[str, type[Map]] = {
     "secant": SecantMap,
     "totals": TotalRatioMap,
     "skew": SkewMap,
-    "bend": QuadraticMap,
+    "bend": PolynomialMap,
 }
 
 

@@ -43,7 +43,7 @@ from bwbayes.sampling.chain import (
 )
 from bwbayes.sampling.proposals import StudentMixture
 
-FORMAT = 4
+FORMAT = 5
 
 Arrays = Mapping[str, Any]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.curvature import QuadraticMap, SkewMap, TotalRatioMap
+from bwbayes.sampling.curvature import PolynomialMap, SkewMap, TotalRatioMap
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.storage import ChainFile
 
@@ -54,11 +54,11 @@ def proposal(phase: Phase) -> StudentMixture:
     weights = generator.dirichlet(np.ones(4))
     if phase != "sampling":
         return StudentMixture(weights, centers, factors)
-    bends, scales = np.zeros((FREE * (FREE + 1) // 2, FREE)), np.zeros((FREE, FREE))
+    terms, bends, scales = np.array([[-1, -1, 0, 0]]), np.zeros((1, FREE)), np.zeros((FREE, FREE))
     bends[0, 1], scales[0, 1] = generator.standard_normal(2)
     totals = TotalRatioMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)), np.array([2.0]))
     skew = SkewMap(centers[1], np.exp(centers[2]), np.full(FREE, 0.8))
-    bend = QuadraticMap(centers[0], factors[0], bends, scales)
+    bend = PolynomialMap(centers[0], factors[0], terms, bends, scales)
     return StudentMixture(weights, centers, factors, (totals, skew, bend))
 
 

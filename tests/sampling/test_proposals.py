@@ -19,7 +19,14 @@ from bwbayes.model.declaration import Declaration, lognormal
 from bwbayes.model.linear import Lag
 from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 from bwbayes.sampling import proposals
-from bwbayes.sampling.curvature import LONGEST, QuadraticMap, SkewMap, TotalRatioMap, fit_maps
+from bwbayes.sampling.curvature import (
+    DEGREE,
+    LONGEST,
+    PolynomialMap,
+    SkewMap,
+    TotalRatioMap,
+    fit_maps,
+)
 from bwbayes.sampling.proposals import StudentMixture
 
 # Two components far apart, so that a draw shows which one it came from, and a wide one.
@@ -126,22 +133,21 @@ def any_skew(free: int, generator: np.random.Generator) -> SkewMap:
     return SkewMap(center, scale, generator.uniform(0.1, 1.9, free))
 
 
-def any_bend(free: int, generator: np.random.Generator) -> QuadraticMap:
+def any_bend(free: int, generator: np.random.Generator) -> PolynomialMap:
     longest = min(free, LONGEST)
-    bends = generator.normal(0, 0.3, (longest * (longest + 1) // 2, free))
-    place = 0
-    for k in range(longest):
-        bends[place : place + k + 1, : k + 1] = 0.0
-        place += k + 1
+    terms = np.sort(generator.integers(-1, longest, (30, DEGREE)), axis=1)
+    terms = terms[np.argsort(terms[:, -1])]
+    bends = generator.normal(0, 0.1, (len(terms), free))
+    bends[terms[:, -1:] >= np.arange(free)] = 0.0
     scales = np.triu(generator.normal(0, 0.1, (longest, free)), 1)
     factor = np.linalg.qr(generator.standard_normal((free, free)))[0] * np.geomspace(1, 0.1, free)
-    return QuadraticMap(generator.standard_normal(free), factor, bends, scales)
+    return PolynomialMap(generator.standard_normal(free), factor, terms, bends, scales)
 
 
 @pytest.mark.parametrize("any_map", [any_totals, any_skew, any_bend])
 @given(free=st.integers(2, 15), seed=st.integers(0, 10**6))
 def test_straight_undoes_bent_and_tells_how_much_it_stretches(
-    any_map: Callable[[int, np.random.Generator], QuadraticMap | SkewMap | TotalRatioMap],
+    any_map: Callable[[int, np.random.Generator], PolynomialMap | SkewMap | TotalRatioMap],
     free: int,
     seed: int,
 ) -> None:
@@ -170,7 +176,7 @@ def test_skewed_tails_are_scipys(power: float, seed: int) -> None:
 def test_what_is_normal_is_neither_bent_nor_widened_nor_skewed() -> None:
     generator = np.random.default_rng(5)
     straight = generator.standard_normal((4000, 6)) @ generator.standard_normal((6, 6))
-    assert QuadraticMap.fitted(straight) is None
+    assert PolynomialMap.fitted(straight) is None
     assert [] == fit_maps(straight)
     # Five errors of a power, which has one of 0.02.
     np.testing.assert_allclose(SkewMap.fitted(straight).powers, 1.0, atol=0.1)
@@ -182,9 +188,8 @@ def test_a_width_is_found_that_another_coordinate_tells() -> None:
     x = np.column_stack([z[:, 0], z[:, 1] * np.exp(0.4 * np.clip(z[:, 0] / 3, -5, 5))])
     x[7, 1] = 50.0
     for draws in (x[8:], x):
-        bend = QuadraticMap.fitted(draws)
+        bend = PolynomialMap.fitted(draws)
         assert bend is not None
-        assert bend.scales is not None
         # The first axis may point either way; an outlier makes sds of others, not widths.
         assert abs(bend.scales[0, 1]) == pytest.approx(0.4, abs=0.06)
 
@@ -231,7 +236,7 @@ def test_places_on_a_ridge_are_taken_several_times_as_often() -> None:
     draws, others = banana(4000), banana(4000, seed=7)
     bent, unbent = StudentMixture.fitted(draws), unstraightened(draws)
     # The tail of one side is the bend's.
-    assert [QuadraticMap] == [type(map_) for map_ in bent.maps]
+    assert [PolynomialMap] == [type(map_) for map_ in bent.maps]
     assert taken(bent, others, log_banana) > 0.7
     assert taken(unbent, others, log_banana) < taken(bent, others, log_banana) / 3
 
@@ -246,7 +251,7 @@ def test_longer_tails_and_widths_are_proposed_as_often_as_they_are() -> None:
     for seed in range(12):
         draws = funnel(2000, seed)
         fits = [fit(draws, log_funnel(draws)) for fit in (StudentMixture.fitted, unstraightened)]
-        assert [SkewMap, QuadraticMap] == [type(map_) for map_ in fits[0].maps]
+        assert [SkewMap, PolynomialMap] == [type(map_) for map_ in fits[0].maps]
         rates.append([taken(proposal, others, log_funnel) for proposal in fits])
         logs = [log_funnel(others) - proposal.log_density(others) for proposal in fits]
         rests.append([np.mean(np.sort(np.exp(weights))[-30:]) for weights in logs])
