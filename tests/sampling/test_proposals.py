@@ -5,6 +5,7 @@ That they leave a distribution as it is, :mod:`tests.sampling.test_moves` shows.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -107,15 +108,15 @@ def test_components_of_hardly_any_draws_give_no_nan(name: str) -> None:
 BEND, WIDTH = 20.0, 0.01
 
 
-def banana(count: int, seed: int = 1) -> FloatArray:
+def banana(count: int, seed: int = 1, power: int = 2) -> FloatArray:
     """Draw from a bent ridge (count, 3): along, across, and beside it."""
     z = np.random.default_rng(seed).standard_normal((count, 3))
-    across = WIDTH * (z[:, 1] + BEND * (z[:, 0] ** 2 - 1))
+    across = WIDTH * (z[:, 1] + BEND * (z[:, 0] ** power - 1))
     return np.column_stack([z[:, 0], across, z[:, 2] + 0.5 * z[:, 0]])
 
 
-def log_banana(x: FloatArray) -> FloatArray:
-    across = x[:, 1] / WIDTH - BEND * (x[:, 0] ** 2 - 1)
+def log_banana(x: FloatArray, power: int = 2) -> FloatArray:
+    across = x[:, 1] / WIDTH - BEND * (x[:, 0] ** power - 1)
     beside = x[:, 2] - 0.5 * x[:, 0]
     return np.asarray(-0.5 * (x[:, 0] ** 2 + across**2 + beside**2))
 
@@ -232,13 +233,17 @@ def unstraightened(draws: FloatArray, log_density: FloatArray | None = None) -> 
         return StudentMixture.fitted(draws, log_density)
 
 
-def test_places_on_a_ridge_are_taken_several_times_as_often() -> None:
-    draws, others = banana(4000), banana(4000, seed=7)
+@pytest.mark.parametrize("power", [2, 3])
+def test_places_on_a_ridge_are_taken_several_times_as_often(power: int) -> None:
+    draws, others = banana(4000, power=power), banana(4000, 7, power)
     bent, unbent = StudentMixture.fitted(draws), unstraightened(draws)
     # The tail of one side is the bend's.
     assert [PolynomialMap] == [type(map_) for map_ in bent.maps]
-    assert taken(bent, others, log_banana) > 0.7
-    assert taken(unbent, others, log_banana) < taken(bent, others, log_banana) / 3
+    rate, plain_rate = (
+        taken(fit, others, partial(log_banana, power=power)) for fit in (bent, unbent)
+    )
+    assert rate > 0.7
+    assert plain_rate < rate / 3
 
 
 def test_longer_tails_and_widths_are_proposed_as_often_as_they_are() -> None:
