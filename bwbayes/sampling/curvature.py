@@ -110,8 +110,8 @@ class PolynomialMap:
             scales[:others, j] = _fit_log_scales(near[:, :others], u[:, j])
         if not bends.any() and not scales.any():
             return None
-        order = np.argsort(terms[:, -1], kind="stable")
-        return cls(center, factor, terms[order], bends[order], scales)
+        by_last = np.argsort(terms[:, -1], kind="stable")
+        return cls(center, factor, terms[by_last], bends[by_last], scales)
 
     @cached_property
     def _inverse(self) -> FloatArray:
