@@ -26,7 +26,7 @@ from bwbayes.arrays import FloatArray, select
 from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES, DiscrepancyNoise, noise_model
-from bwbayes.inference.parameter_table import ParameterTable
+from bwbayes.inference.parameters import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, positive
 from bwbayes.model.inputs import Limits, Span

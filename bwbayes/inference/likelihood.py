@@ -25,7 +25,7 @@ from bwbayes.inference import heavy_tails
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.heavy_tails import Followed
-from bwbayes.inference.parameter_table import ParameterTable
+from bwbayes.inference.parameters import ParameterTable
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs, Span, rate

@@ -21,8 +21,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, Score, batches
-from bwbayes.inference.parameter_table import ParameterTable
-from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.parameters import JointPrior, ParameterTable
 from bwbayes.shown import brief
 
 # Normal scores of the priors' models, 97% of them, whose readings are fitted.

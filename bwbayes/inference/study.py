@@ -25,8 +25,7 @@ from bwbayes.inference.defaults import join_ranges, ranges_of
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import NOISES, noise_model
-from bwbayes.inference.parameter_table import Column, ParameterTable
-from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.parameters import Column, JointPrior, Parameter, ParameterTable
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import OFFSET
 from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges

@@ -8,8 +8,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.defaults import ranges_of
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import noise_model
-from bwbayes.inference.parameter_table import ParameterTable
-from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.parameters import JointPrior, Parameter, ParameterTable
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
