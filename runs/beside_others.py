@@ -9,7 +9,8 @@ large loops, as they were fitted, and a decay to rest with a hold, which were no
   sd;
 - emcee: Bouc-Wen with a lag, white noise, flat priors of log parameters, emcee's default move, from
   where least squares ends;
-- bwbayes: everything left to its defaults.
+- bwbayes: everything left to its defaults, but for the effective draws: bands need no more than
+  1,000, of 2,000.
 
     python runs/beside_others.py RECORD.csv [--figure FILE]
 """
@@ -167,9 +168,9 @@ def start(record: bw.Record) -> FloatArray:
 
 
 def by_bwbayes(record: bw.Record, fitted: BoolArray) -> Band:
-    """Leave everything to bwbayes; a lead-in of a second tells where each test starts."""
+    """Leave the model to bwbayes; a lead-in of a second tells where each test starts."""
     first, last = record.time[fitted][[0, -1]].tolist()
-    run = bw.fit(record, train=(first, last), seed=1, progress=False)
+    run = bw.fit(record, train=(first, last), seed=1, ess=1000, progress=False)
     bands = run.predict(record, lead_in_start=2.0, lead_in=1.0)
     return bands.mean, bands.lower["sensor", 95], bands.upper["sensor", 95]
 
@@ -211,26 +212,36 @@ class Comparison:
         return table
 
     def draw(self, path: Path) -> None:
-        """Draw what each method leaves of the readings, and its band, along both tests."""
-        measured, clock = np.asarray(self.record.displacement), self.record.time
+        """Draw the readings, and what each method leaves of them beside its band.
+
+        Readings outside of a band are red; a title says which share each test has inside.
+        """
+        measured, clock, table = np.asarray(self.record.displacement), self.record.time, self.table
         shown = within(clock, (min(TESTS.values())[0], max(TESTS.values())[1]))
-        figure, axes = plt.subplots(
-            1 + len(self.bands), sharex=True, figsize=(8, 7), layout="constrained"
+        figure, (top, *panels) = plt.subplots(
+            1 + len(self.bands), sharex=True, figsize=(5, 6), layout="constrained"
         )
-        axes[0].plot(clock[shown], measured[shown], color="0.2", linewidth=0.6)
-        axes[0].set_ylabel("displacement, µm")
-        for panel, (name, (mean, lower, upper)) in zip(axes[1:], self.bands.items(), strict=True):
-            edges = (lower - mean)[shown], (upper - mean)[shown]
-            panel.fill_between(clock[shown], *edges, color="C0", alpha=0.3, label="95% band")
-            panel.plot(
-                clock[shown], (measured - mean)[shown], "k.", markersize=1, label="reading − mean"
-            )
-            panel.set_title(name, loc="left", fontsize="medium")
+        top.plot(clock[shown], measured[shown], color="0.3", linewidth=0.8)
+        top.set_ylabel("reading, µm")
+        for name, window in TESTS.items():
+            middle = float(np.mean(window))
+            top.text(middle, 1.03, name, transform=top.get_xaxis_transform(), ha="center")
+        for panel, (name, (mean, lower, upper)) in zip(panels, self.bands.items(), strict=True):
+            error, edges = measured - mean, ((lower - mean)[shown], (upper - mean)[shown])
+            out = shown & ((measured < lower) | (measured > upper))
+            panel.fill_between(clock[shown], *edges, color="C0", alpha=0.3, linewidth=0)
+            panel.plot(clock[shown & ~out], error[shown & ~out], "k.", markersize=1)
+            panel.plot(clock[out], error[out], ".", color="C3", markersize=2)
+            covered = (f"{table[name][test]['covered_percent']:.0f}%" for test in TESTS)
+            title = f"{name}: 95% band holds {' / '.join(covered)}"
+            panel.set_title(title, loc="left", fontsize="medium")
             panel.set_ylabel("error, µm")
-            panel.set_ylim(-1.6, 1.6)
-        axes[1].legend(loc="upper right", ncols=2, fontsize="small")
-        axes[-1].set_xlabel("time, s (fitted: 25 to 36 s)")
-        figure.savefig(path, dpi=110)
+            panel.set_ylim(-1.3, 1.3)
+        for axes in (top, *panels):
+            axes.axvline(max(TESTS["large loops"]), color="0.6", linewidth=0.8)
+            axes.margins(x=0)
+        panels[-1].set_xlabel("time, s (fitted: 25 to 36 s)")
+        figure.savefig(path, dpi=130)
         plt.close(figure)
 
 

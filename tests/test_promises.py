@@ -46,6 +46,7 @@ FIXED = ["count causes and fixes/*/right", "causes and fixes/seeds"]
 SPOILT = ["#spoilt runs do not hold", "max spoilt runs do not hold/*/seen"]
 ANSWERS = ["ordinary answers/seeds"]
 CHOICES = ["which model/records"]
+OTHERS = ("least squares", "plays, least squares", "emcee, white noise", "bwbayes")
 SPECIMENS = ["campaign/specimens"]
 
 
@@ -68,6 +69,11 @@ def of_times(kind: str) -> Quoted:
 def of_cost(model: str) -> Quoted:
     """Return the core seconds of a model's fits, from short records to long ones."""
     return Quoted([f"cost of a fit/{model}/{length}/core s" for length in LENGTHS[model]])
+
+
+def of_others(test: str, name: str) -> Quoted:
+    """Return what each method finds in a test on the measured stack."""
+    return Quoted([f"beside others/{method}/{test}/{name}" for method in OTHERS])
 
 
 CLAIMS: dict[str, Quoted] = {
@@ -279,6 +285,12 @@ CLAIMS: dict[str, Quoted] = {
     "... simulations for an effective draw, burn-in included": Quoted(
         ["extent cost of a fit/*/evaluations a draw"]
     ),
+    "Error on loops as fitted, least squares/plays/emcee/bwbayes, % of the range": of_others(
+        "large loops", "error_percent"
+    ),
+    "... on a decay and a hold": of_others("decay and hold", "error_percent"),
+    "... their 95% bands cover, loops, %": of_others("large loops", "covered_percent"),
+    "... their 95% bands cover, decay and hold, %": of_others("decay and hold", "covered_percent"),
     "Log evidence less that of nested sampling (dynesty)": Quoted(
         ["log evidence of the measured record/less dynesty's"]
     ),

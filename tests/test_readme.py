@@ -27,6 +27,7 @@ from tests.app import small
 from tests.examples import README, ROOT, blocks
 from tests.measured import assert_quotes, keep, measured, quotes
 from tests.test_measured_stack import RECORD
+from tests.test_promises import OTHERS
 from tests.test_what_drives_tell import DRIVES, LENGTHS
 
 
@@ -145,7 +146,7 @@ def test_the_quoted_campaign_is_that_of_the_last_benchmark() -> None:
 
 def test_the_quoted_evaluations_of_an_effective_draw_are_those_of_the_run(summary: Any) -> None:
     """Of the draws that count, within a fifth: effective draws are estimates."""
-    quoted = re.search(r"one costs \*\*([\d.]+)\*\* simulations", " ".join(README.split()))
+    quoted = re.search(r"One costs \*\*([\d.]+)\*\* simulations", " ".join(README.split()))
     assert quoted
     least = min(min(row["ess_bulk"], row["ess_tail"]) for row in summary["parameters"].values())
     evaluations = sum(summary["sampling"]["proposals"].values())
@@ -157,6 +158,7 @@ def test_the_quoted_limits_are_those_of_the_last_full_run() -> None:
     assert_quotes(
         text,
         "extent 100 moving, */coverage and t/*/95/0",
+        "extent 100 one answer at any rate/coverage/*/95",
         "extent 100 untried/coverage/*",
         "extent 100 a * discrepancy of 1.3 s/coverage/95",
         "ordinary answers/other/False",
@@ -182,9 +184,9 @@ def test_what_drives_tell_is_what_the_last_full_run_found() -> None:
 def test_what_other_methods_say_is_what_the_last_full_run_found() -> None:
     names = ("error_um", "error_percent", "width_um", "covered_percent")
     rows = [line.split("|")[2:-1] for line in block("numbers: beside others").strip().splitlines()]
-    methods = ("least squares", "plays, least squares", "emcee, white noise", "bwbayes")
-    for cells, found in zip(rows[2:], methods, strict=True):
+    for (*cells, seconds), found in zip(rows[2:], OTHERS, strict=True):
         row = measured()["beside others"][found]
+        assert quotes(seconds.strip(), row["core s"]), found
         for cell, name in zip(cells, names, strict=True):
             for text, test in zip(cell.split("/"), ("large loops", "decay and hold"), strict=True):
                 assert quotes(text.strip(), row[test][name]), (found, test, name)
