@@ -79,8 +79,7 @@ def test_whole_fit_of_million_samples_takes_two_gibibytes() -> None:
 ONE_STEP = """
 from dataclasses import replace
 import numpy as np
-from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import pilot_moves
+from bwbayes.sampling.moves import advance, pilot_moves, start
 from bwbayes.inference.map_estimate import MAPEstimate
 from tests.inference.problems import short_posterior
 
@@ -120,8 +119,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 import numpy as np
-from bwbayes.sampling.storage import ChainFile
-from bwbayes.sampling.chain import Block, draws, log_densities
+from bwbayes.sampling.chain import Block, ChainFile, draws, log_densities
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import init_chain, sample

@@ -51,8 +51,7 @@ from bwbayes.sampling.diagnostics import (
     pareto_k,
     times,
 )
-from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import pilot_moves, sampling_moves
+from bwbayes.sampling.moves import advance, pilot_moves, sampling_moves, start
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.secant import SecantMap, linear

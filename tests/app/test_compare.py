@@ -19,7 +19,7 @@ from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.record import Record, read_record
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.chain import ChainFile
 from tests.app import small
 from tests.app.conftest import Type
 from tests.app.steps import Steps

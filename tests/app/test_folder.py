@@ -37,7 +37,7 @@ from bwbayes.errors import InputError
 from bwbayes.model.declaration import Distribution
 from bwbayes.record import read_record
 from bwbayes.sampling import sampler
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.chain import ChainFile
 from tests.app import small
 from tests.forks import FORKS
 

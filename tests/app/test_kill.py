@@ -24,8 +24,7 @@ from bwbayes.app.fit import fitted
 from bwbayes.app.running import run as run_module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
-from bwbayes.sampling.chain import PHASES, Phase
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.chain import PHASES, ChainFile, Phase
 from tests.app import small
 from tests.forks import FORKS
 from tests.measured import keep

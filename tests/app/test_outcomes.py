@@ -27,7 +27,7 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import BandValidation, ValidationSummary
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.chain import ChainFile
 from tests.app import small
 from tests.app.conftest import Type
 

@@ -24,7 +24,7 @@ from bwbayes.record import Record, read_record, write_record
 from bwbayes.report.report import Report, as_text
 from bwbayes.report.result import Result
 from bwbayes.report.run import priors_table
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.chain import ChainFile
 from tests.app import example
 from tests.app.test_hostile_input import QUICK, good_arrays, stored
 from tests.sampling.chains import finish, new

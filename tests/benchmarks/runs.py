@@ -34,8 +34,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import generator
 from bwbayes.sampling.chain import Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult, as_chains
-from bwbayes.sampling.ensemble import advance
-from bwbayes.sampling.moves import sampling_moves
+from bwbayes.sampling.moves import advance, sampling_moves
 from bwbayes.sampling.sampler import init_chain, sample
 from tests.benchmarks.measuring import ROOT, Call, Cell, Table, interleaved, timed
 from tests.benchmarks.models import MODELS, by_engine, paper_record, speed_up

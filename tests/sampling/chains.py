@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from bwbayes.inference.map_estimate import MAPEstimate
-from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
+from bwbayes.sampling.chain import PHASES, Block, Chain, ChainFile, EnsembleState, Phase
 from bwbayes.sampling.curvature import PolynomialMap, SkewMap, TotalRatioMap
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.storage import ChainFile
 
 ENSEMBLES, WALKERS, FREE, STEPS = 4, 16, 8, 50
 ATTRIBUTES: dict[str, str | int] = {

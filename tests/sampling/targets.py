@@ -19,8 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import WeightedMoves
+from bwbayes.sampling.moves import WeightedMoves, advance, start
 from bwbayes.sampling.proposals import StudentMixture
 
 REPLICATES = 12

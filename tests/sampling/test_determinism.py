@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.sampling.chain import PHASES, Phase
+from bwbayes.sampling.chain import PHASES, ChainFile, Phase
 from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import init_chain, sample
-from bwbayes.sampling.storage import ChainFile
 from tests.forks import FORKS
 from tests.sampling.chains import arrays, assert_same
 from tests.sampling.targets import gaussian

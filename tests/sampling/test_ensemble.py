@@ -9,8 +9,7 @@ from emcee.moves import DEMove, StretchMove
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.chain import Block, EnsembleState, pack_random_state, unpack_random_state
-from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import WeightedMoves, pilot_moves, sampling_moves
+from bwbayes.sampling.moves import WeightedMoves, advance, pilot_moves, sampling_moves, start
 from bwbayes.sampling.proposals import StudentMixture
 from tests.sampling.targets import gaussian, target
 

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.chain import PHASES, ChainFile
 from tests.sampling.chains import (
     ATTRIBUTES,
     PLAN,

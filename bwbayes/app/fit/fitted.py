@@ -28,8 +28,7 @@ from bwbayes.errors import InputError, NotConvergedError, Renamed
 from bwbayes.model.spec import ModelSpec
 from bwbayes.quantities import DEFAULT
 from bwbayes.report.report import Shown
-from bwbayes.sampling.chain import PHASES, draws, log_densities
-from bwbayes.sampling.storage import ChainFile
+from bwbayes.sampling.chain import PHASES, ChainFile, draws, log_densities
 from bwbayes.watching import Watch, WatchSteps, parts, unwatched, watched
 
 if TYPE_CHECKING:

@@ -30,9 +30,8 @@ from bwbayes.inference.engine import Engine, resolve_engine
 from bwbayes.inference.voltage_noise import path_covariance
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.result import render, write_bands, write_summary
-from bwbayes.sampling.chain import PHASES
+from bwbayes.sampling.chain import PHASES, ChainFile
 from bwbayes.sampling.sampler import init_chain, sample
-from bwbayes.sampling.storage import ChainFile
 from bwbayes.watching import WatchSteps, part, unwatched
 
 
