@@ -29,7 +29,7 @@ Put = Callable[[FloatArray, FloatArray], FloatArray]
 FEW = 50
 
 # Starts that each draw tries where they have several unknowns, and how often these move at a step.
-TRIES, MOVES = 8, 3
+TRIES, MOVES = 16, 5
 
 
 @dataclass(frozen=True)
