@@ -33,12 +33,16 @@ from bwbayes.inference.thinning import (
 from bwbayes.model.inputs import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
+from bwbayes.record.voltage_path import VoltagePath
 from bwbayes.shown import rounded
 from bwbayes.watching import Watch, unwatched
 
 # Number of readings used: an explanation takes some hundred passes over them, and the residual of a
 # model shows in fewer.
 READINGS = 4_000
+
+# Number of paths from which the error of a noisy voltage's path is estimated.
+PATHS = 4
 
 
 class Sighting(NamedTuple):
@@ -317,6 +321,34 @@ class ResidualAnalysis:
         now = -0.5 * (float(np.sum(white**2)) + float(log_determinant[0]))
         return float(-0.5 * (np.sum(np.log(sensor)) + residual.size) - now)
 
+    @cached_property
+    def path_worth(self) -> float:
+        """Expected gain in log likelihood, nats, if the voltage's path were known exactly.
+
+        A stage in front of the hysteresis may gain as much by smoothing the path's error alone. It
+        is the mean of ½ |W (x(v) − x(u))|² for paths v that are estimated of the path u with new
+        noise on it, W whitens the readings; 0 where the voltage has no noise.
+        """
+        whole, record = self.whole.single_record, self.posterior.single_record
+        noise_sd = self.study.records[whole.name].path.noise_sd
+        if not noise_sd:
+            return 0.0
+        path = VoltagePath(whole.voltage, noise_sd)
+        theta = self.posterior.prior.theta(self.fit.free[np.newaxis])
+
+        def white(along: Posterior) -> FloatArray:
+            residual = record.readings.values - along.simulate(theta, record.readings.rows)
+            return self.posterior.likelihood.innovations(record.table.noise(theta), residual)
+
+        worths = []
+        for _ in range(PATHS):
+            inputs = replace(whole.inputs, voltage=path.redrawn(self.generator))
+            voltage = thin(replace(whole, inputs=inputs), self.stride).inputs
+            changed = replace(record, inputs=voltage)
+            moved = white(replace(self.posterior, datasets=(changed,))) - white(self.posterior)
+            worths.append(0.5 * float(np.sum(moved**2)))
+        return float(np.mean(worths))
+
     @property
     def lead(self) -> float:
         """Log evidence, nats, of the fit that explanations are compared with, minus this fit's."""
@@ -419,12 +451,17 @@ class ResidualAnalysis:
             fix = f"state {statement}" if spec == self.study.spec else f"{fix}, with {statement}"
         if advice:
             fix = advice if any(flags.values()) else f"{advice}, or {fix}"
+        smooths = any(
+            stage.side == "input" and not stage.rate_independent
+            for stage in posterior.single_record.actuator.stages
+            if stage.name in {*spec.chain} - {*self.study.spec.chain}
+        )
         yield compared.explained(
             kind,
             f"{text}{sighting.note}",
             fix,
             fit,
-            sighting.cost,
+            sighting.cost + (self.path_worth if smooths else 0.0),
             shift=compared._shift(fit),
             spec=spec,
             stated=stated,
