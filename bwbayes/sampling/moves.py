@@ -6,15 +6,12 @@ bring the pilot to the posterior, where half of its steps try places of the poin
 Once the pilot is there, a mixture of Student-t distributions fitted to its draws, and bent as they
 are, proposes places independently of where a walker is, which mixes about ten times faster. The fit
 is frozen before the draws that count, and a seventh of the steps remain differential evolution and
-snooker, in the coordinates that the fit makes straight, so that walkers reach the places that it
-does not cover, and leave them again.
+snooker, so that walkers reach the places that the fit does not cover, and leave them again.
 
-Ensembles of walkers, some steps further: the unit of work of a sampling.
-
-:func:`advance` is a pure function of the posterior and each :class:`EnsembleState`, random state
-included. So it does not matter where, when or in which order ensembles run: a run with two
-workers, or one that was interrupted and resumes, gives the same bits. The steps themselves are
-those of ``emcee.EnsembleSampler`` with the given emcee moves.
+An ensemble takes some steps by ``emcee.EnsembleSampler`` with these moves: :func:`advance` is a
+pure function of the posterior and each :class:`EnsembleState`, random state included. So it does
+not matter where, when or in which order ensembles run: a run with two workers, or one that was
+interrupted and resumes, gives the same bits.
 """
 
 from __future__ import annotations
@@ -37,7 +34,6 @@ from bwbayes.sampling.chain import (
     pack_random_state,
     unpack_random_state,
 )
-from bwbayes.sampling.curvature import Map, apply_maps, invert_maps
 from bwbayes.sampling.proposals import StudentMixture
 
 # Moves of emcee with their weights, by their name in reports.
@@ -73,32 +69,6 @@ class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no type
         proposed = distance + 1.7 * along
         factor = (moving.shape[1] - 1) * (np.log(np.abs(proposed)) - np.log(distance))
         return z + proposed * direction, factor[:, 0]
-
-
-class StraightMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no types
-    """Steps of another move in the coordinates that maps make straight.
-
-    Differences of walkers on a curved ridge lead off it, and hardly one step in a hundred is
-    accepted; where the maps make the ridge straight, walkers follow it, to its ends as well.
-    """
-
-    def __init__(self, move: moves.RedBlueMove, maps: Sequence[Map]) -> None:
-        super().__init__()
-        self.move, self.maps = move, maps
-
-    def setup(self, coords: FloatArray) -> None:
-        """Set the other move up for coordinates (walkers, free)."""
-        self.move.setup(coords)
-
-    def get_proposal(
-        self, moving: FloatArray, others: list[FloatArray], random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose for ``moving`` (walkers, free), given the walkers of the other half."""
-        here, log_slope = apply_maps(self.maps, moving)
-        resting = [apply_maps(self.maps, walkers)[0] for walkers in others]
-        proposed, factor = self.move.get_proposal(here, resting, random)
-        coords, log_stretch = invert_maps(self.maps, proposed)
-        return coords, factor + log_slope + log_stretch
 
 
 class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
@@ -229,10 +199,9 @@ def _weighted_moves(
 
     emcee divides the weights by their sum.
     """
-    maps = () if proposal is None else proposal.maps
-    weighted: dict[str, tuple[moves.Move, float]] = {
-        "differential evolution": (StraightMove(moves.DEMove(), maps), 0.8 * (1 - share)),
-        "snooker": (StraightMove(SnookerMove(), maps), 0.2 * (1 - share)),
+    weighted = {
+        "differential evolution": (moves.DEMove(), 0.8 * (1 - share)),
+        "snooker": (SnookerMove(), 0.2 * (1 - share)),
     }
     if proposal is not None:
         weighted["mixture"] = IndependenceMove(proposal, tries, ahead), share

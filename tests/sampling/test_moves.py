@@ -15,13 +15,7 @@ from emcee.moves import DEMove, Move
 from hypothesis import given, strategies as st
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.sampling.moves import (
-    IndependenceMove,
-    SnookerMove,
-    StraightMove,
-    WeightedMoves,
-    sampling_moves,
-)
+from bwbayes.sampling.moves import IndependenceMove, SnookerMove, WeightedMoves, sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
 from tests.sampling.targets import ALARM, TARGETS, worst_score
 
@@ -66,12 +60,6 @@ class Eager(IndependenceMove):
 RIGHT: dict[str, Callable[[str], WeightedMoves]] = {
     "differential evolution": lambda _: {"move": (DEMove(), 1.0)},
     "snooker": lambda _: {"move": (SnookerMove(), 1.0)},
-    "differential evolution, straight": lambda name: {
-        "move": (StraightMove(DEMove(), fitted(name).maps), 1.0)
-    },
-    "snooker, straight": lambda name: {
-        "move": (StraightMove(SnookerMove(), fitted(name).maps), 1.0)
-    },
     "a place": lambda name: {"move": (IndependenceMove(fitted(name)), 1.0)},
     "one of several places": lambda name: {
         "move": (IndependenceMove(TARGETS[name].proposal, 5), 1.0)
