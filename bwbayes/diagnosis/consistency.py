@@ -19,12 +19,12 @@ disagreement: D is a difference of likelihoods, independent of the coordinates.
 The innovations show whether a record has another noise: at the joint mode they have a root mean
 square of 1 if the shared noise is that of the record.
 
-Conflicts of priors and posterior: disagreement, pressure against a bound, another unit.
-
-A finding's kind is the parameter, and its fix a line of config. The same findings come from the
-point fit, before any sampling, by :func:`around`, and from the posterior's draws. The score of a
-parameter that its prior describes exceeds three once in 400 times, and more rarely if the posterior
-is wide; a posterior that is flat between its bounds or has its peak inside does not press.
+Priors may conflict with the posterior, too: they disagree, it presses against a bound, or its unit
+is another. A finding's kind is the parameter, and its fix a line of config. The same findings come
+from the point fit, before any sampling, by :func:`around`, and from the posterior's draws. The
+score of a parameter that its prior describes exceeds three once in 400 times, and more rarely if
+the posterior is wide; a posterior that is flat between its bounds or has its peak inside does not
+press.
 """
 
 from __future__ import annotations

@@ -5,13 +5,12 @@ below their number: a discrepancy has a long correlation time, and the parameter
 all along. The sizes of these parts follow from the bands. A departure that chance may explain has
 the probability of that on a record that the fitted model describes.
 
-Causes of bands that fail on readings that were not fitted: shapes in the residuals, by evidence.
-
-Given the bands, residuals are jointly normal: the parameters' error, the discrepancy, the sensor's
-noise. Each cause adds shapes of unknown size (a constant, a trend, a decay at the start, the mean
-itself, ...) with a normal prior, so that its evidence is exact and costs one pass of the noise's
-filter. Where residuals are too large, a cause has to explain most of the excess. For readings that
-were fitted, :mod:`bwbayes.diagnosis.explanations` finds the causes.
+The causes of bands that fail on readings that were not fitted are shapes in the residuals. Given
+the bands, residuals are jointly normal: the parameters' error, the discrepancy, the sensor's noise.
+Each cause adds shapes of unknown size (a constant, a trend, a decay at the start, the mean itself,
+...) with a normal prior, so that its evidence is exact and costs one pass of the noise's filter.
+Where residuals are too large, a cause has to explain most of the excess. For readings that were
+fitted, :mod:`bwbayes.diagnosis.explanations` finds the causes.
 """
 
 from __future__ import annotations

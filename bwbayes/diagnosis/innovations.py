@@ -6,11 +6,10 @@ innovations that the residuals hide: whether they are white, and whether their m
 voltage (its rate, its level, its direction). A departure is reported where it is both beyond chance
 and large enough to matter; of records that the model describes fewer than one in a hundred has one.
 
-Posterior predictive checks: a comparison of the record with records that the model replicates.
-
-Some posterior draws replicate the readings, each with its own noise. The statistics of the real
-readings (their range, the area of their loops, the correlation and the spectrum of their residuals,
-their place in the band) are worked out for the replicated ones, too. A statistic that hardly any
+Posterior predictive checks compare the record with records that the model replicates. Some
+posterior draws replicate the readings, each with its own noise. The statistics of the real readings
+(their range, the area of their loops, the correlation and the spectrum of their residuals, their
+place in the band) are worked out for the replicated ones, too. A statistic that hardly any
 replicated record reaches shows an effect that the model, noise included, lacks.
 """
 

@@ -1,14 +1,13 @@
-"""Test whether the residual follows the drive: then its size on another drive may be larger.
+"""Rivals of a model: models of other families that fit the same record, and their disagreement.
 
-A disturbance of the sensor or of the room is independent of the voltage; the residual of a wrong
+They matter where the residual follows the drive: then its size on another drive may be larger. A
+disturbance of the sensor or of the room is independent of the voltage; the residual of a wrong
 model comes back wherever the drive repeats itself. Each residual, less its mean over a period of
 the drive, is compared with the mean of those at other times where the drive was most alike. The
 correlation of both is compared with that of residuals drawn from the fitted noise, which has the
 residual's size and correlation time and is independent of the drive. For drives that hardly repeat,
 a second test predicts parts of the record from others: plays, powers and lags of the voltage are
 fitted to the whitened residual in all parts but one, and their prediction is tested on that one.
-
-Rivals of a model: models of other families that fit the same record, and their disagreement.
 
 If a model's residual follows the drive, the record does not show its size on another drive. Models
 of other families that fit the record about as well show how large it may be: another operator, the

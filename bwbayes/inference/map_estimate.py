@@ -5,10 +5,7 @@ of their steps; from the best ones the posterior's own modes follow by Newton st
 parameters. The curvature there is the Gaussian approximation: it starts the sampler and is never
 the answer itself. The modes of a long record are looked for in a thinned one, or in its beginning.
 
-Least squares of the physical parameters, from several starts side by side.
-
-Its optima are where climbs to a posterior's modes begin: they do not depend on the noise, and are
-cheap to find.
+The optima of least squares do not depend on the noise, and several starts side by side are cheap.
 """
 
 from __future__ import annotations

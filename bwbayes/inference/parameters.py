@@ -10,11 +10,10 @@ posterior has Gaussian tails even where it leans on a bound (γ near β, a discr
 Where a record determines only the sum of parameters, as of a delay and a lag, the sum takes the
 place of one of them: lags are logarithms there, and the posterior would be thin and curved.
 
-The table of a model's parameters: one order of θ's columns, and everybody asks by name.
-
-The actuator's parameters come first, then the noise's, each in the order in which their parts
-declare them. Several records of one actuator share the actuator's parameters. Each record has its
-own initial state and offset, side by side, named after it: ``offset[step_10]``.
+A table gives θ's columns one order, and names to ask for them. The actuator's parameters come
+first, then the noise's, each in the order in which their parts declare them. Several records of one
+actuator share the actuator's parameters. Each record has its own initial state and offset, side by
+side, named after it: ``offset[step_10]``.
 """
 
 from __future__ import annotations

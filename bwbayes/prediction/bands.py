@@ -9,11 +9,10 @@ Coverage alone proves little. A wide band covers too, so width, CRPS and interva
 beside it; and the residuals of one record are correlated, so that a window holds few independent
 chances to miss. A block bootstrap says how far the coverage may lie from nominal by luck.
 
-A band that has failed validation, corrected from the readings that it failed on.
-
-The held-out readings fall into blocks longer than their residual is correlated, so that blocks are
-nearly independent, and as good as a block of the next record of the same kind of drive. With F_j(f)
-the share of block j's readings inside the band, f times as wide about its mean, and n blocks,
+A band that has failed validation is corrected from the readings that it failed on. The held-out
+readings fall into blocks longer than their residual is correlated, so that blocks are nearly
+independent, and as good as a block of the next record of the same kind of drive. With F_j(f) the
+share of block j's readings inside the band, f times as wide about its mean, and n blocks,
 
     f = the least one with  Σ_j F_j(f) >= level (n + 1),
 

@@ -4,10 +4,9 @@ Every posterior draw is driven slowly, without dynamics, creep and offset: up an
 whole range of the record's voltage until the loop closes (the major loop), the same over half of
 that range (the minor loop), and once from the demagnetized state (the initial curve).
 
-Step responses: how fast an actuator rises, whether it overshoots, and how it creeps.
-
-Every posterior draw, demagnetized and at rest, gets an ideal step of the voltage from zero, as in
-the paper's Fig. 5. The recursions are exact at any interval, so the displacement a time t after the
+Step responses say how fast an actuator rises, whether it overshoots, and how it creeps. Every
+posterior draw, demagnetized and at rest, gets an ideal step of the voltage from zero, as in the
+paper's Fig. 5. The recursions are exact at any interval, so the displacement a time t after the
 step is that of one sample as long as t: the response comes at times that are evenly spaced on a log
 axis, from a microsecond to minutes, whatever the sampling rate of the record.
 """

@@ -4,12 +4,10 @@ Everything that is written or drawn after sampling comes from a :class:`Result`.
 has not converged, the result keeps the draws but contains no interval: no parameter table, no
 bands, no scores.
 
-The files of a report and of a finished run: page, pictures, posterior, bands, numbers.
-
-Each file is written under another name and renamed when it is complete, so that a reader never sees
-half a file. A page is one self-contained HTML file, which runs no scripts except its own, fetches
-nothing, and holds the numbers of a table twice: rounded, for reading, and exactly, in the CSV
-behind its button.
+Its files are page, pictures, posterior, bands and numbers. Each file is written under another name
+and renamed when it is complete, so that a reader never sees half a file. A page is one
+self-contained HTML file, which runs no scripts except its own, fetches nothing, and holds the
+numbers of a table twice: rounded, for reading, and exactly, in the CSV behind its button.
 """
 
 from __future__ import annotations

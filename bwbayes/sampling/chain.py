@@ -4,11 +4,10 @@ A :class:`Chain` keeps it in memory; a :class:`ChainFile` writes it to files as 
 the pilot and the tuning are kept apart from those that count, and so are blocks of the sampling
 whose proposal turned out not to cover the posterior.
 
-The chain on disk: a folder of NumPy files that grows by one file a block.
-
-A file gets its name only when it is written, so that a process killed at any moment loses the
-current block and nothing else. The files are of NumPy's own format, whose members carry checksums:
-if a disk has damaged a chain, the part before the damage is used. This module alone uses the files:
+On disk a chain is a folder of NumPy files that grows by one file a block. A file gets its name only
+when it is written, so that a process killed at any moment loses the current block and nothing else.
+The files are of NumPy's own format, whose members carry checksums: if a disk has damaged a chain,
+the part before the damage is used. This module alone uses the files:
 
     start.npz                        starts of the ensembles, the point fit, the pilot's proposal,
                                      and what was run, as JSON

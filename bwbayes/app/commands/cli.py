@@ -6,12 +6,9 @@ failed. 5: converged, but validation is inconclusive. 130: interrupted; what was
 141: nobody reads its output any more, as behind `head`; a run can be resumed. Commands that build
 on a run end with the status of that run.
 
-A verb as a command: words and options from its arguments, help from its docstring.
-
-All of it is read from the function's source: loading it takes a second, which neither ``--help``
-nor completion should wait for.
-
-Shared parts of the commands: output, exit status and errors.
+A verb gives its command words and options by its arguments, and help by its docstring. All of it is
+read from the function's source: loading it takes a second, which neither ``--help`` nor completion
+should wait for.
 
 Errors speak to those who call the package from Python, of arguments and functions in backticks:
 ``overwrite=True``, ``bwbayes.resume("results/a", steps=100)``. On the command line the same

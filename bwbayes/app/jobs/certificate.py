@@ -5,11 +5,9 @@ instruments, as [certificate] in the config says; the model's equation, its quan
 intervals, their budget, what was validated, and the limits of use. It is none where validation
 failed, and says so in the first line.
 
-Which quantities of a run get an uncertainty budget, and their values of each draw.
-
-These are the slope d (or the operator's first parameter), the largest width of the loop, and the
-displacement at the highest voltage of what is predicted: a record of its own, or else a held-out
-window, or else the training one.
+The quantities that get an uncertainty budget are the slope d (or the operator's first parameter),
+the largest width of the loop, and the displacement at the highest voltage of what is predicted: a
+record of its own, or else a held-out window, or else the training one.
 """
 
 from __future__ import annotations

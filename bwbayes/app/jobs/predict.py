@@ -6,7 +6,7 @@ the readings, if there are any. Rivals of the model, if it has any, widen the ba
 drives, by what they differ from the model as it was fitted. Random numbers hang on the data alone:
 the same record under another name gets the same bands.
 
-Bands for another record, a planned voltage or a signal: ``fit.predict()``.
+``fit.predict()`` gives bands for another record, a planned voltage or a signal.
 """
 
 from __future__ import annotations

@@ -9,9 +9,7 @@ There is no closed form. Where the walls do not move, one implicit equation rema
 solved to rounding; where they move, an implicit method of order five with steps of its own for
 each model follows them, with an error below 1e-6 of the range of the displacement.
 
-The equation of pinned walls along a rising voltage, and what integrates it.
-
-It is that of :class:`Pinned`. Where P_an is below P_irr, P follows
+Along a rising voltage the equation is that of :class:`Pinned`. Where P_an is below P_irr, P follows
 from an implicit equation, which is solved to rounding; from where they meet, which is known in
 closed form, an implicit method of order five takes over, with steps of its own for each model:
 walls that are hardly pinned follow P_an within a voltage k that is small against all others. An

@@ -5,11 +5,10 @@ it is until the slot's other end takes it along: z = max(u − r, min(u + r, z))
 weights that are not negative has loops that depend on how far the voltage went alone, wherever it
 did; from a turn on its path is the first curve, twice as large (Masing's rules).
 
-Maxwell-slip: springs that slip, in parallel; Prandtl-Ishlinskii read from the other side.
-
-A spring that slips beyond a strain r (a stop) follows the voltage up to there, then stays: its
-strain is s = u − z, with z the play of threshold r. The displacement that the springs hold back is
-the hysteresis. A sum of stops is therefore a sum of plays with another linear part.
+Maxwell-slip is Prandtl-Ishlinskii read from the other side, springs that slip, in parallel. A
+spring that slips beyond a strain r (a stop) follows the voltage up to there, then stays: its strain
+is s = u − z, with z the play of threshold r. The displacement that the springs hold back is the
+hysteresis. A sum of stops is therefore a sum of plays with another linear part.
 """
 
 from __future__ import annotations

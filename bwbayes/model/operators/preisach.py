@@ -5,12 +5,11 @@ of two bells, one over each of the switching voltages, so that loops are wide ab
 narrow toward saturation. Loops between the same two voltages are alike, as in every Preisach
 model; loops of the same size at another mean voltage are not, unlike in Prandtl-Ishlinskii.
 
-Krasnosel'skii-Pokrovskii: Preisach's model with relays that switch along a ramp.
-
-A relay jumps; here it goes from down to up while the voltage rises by the ramp's width, and stays
-where it is when the voltage turns half way. Such a ramp is a mean of relays whose two switching
-voltages are shifted together. So the model is a Preisach model whose density, and with it its
-Everett function, is averaged over that shift: wider bells with the same corner at small loops.
+Krasnosel'skii-Pokrovskii is Preisach's model with relays that switch along a ramp. A relay jumps;
+here it goes from down to up while the voltage rises by the ramp's width, and stays where it is when
+the voltage turns half way. Such a ramp is a mean of relays whose two switching voltages are shifted
+together. So the model is a Preisach model whose density, and with it its Everett function, is
+averaged over that shift: wider bells with the same corner at small loops.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 A loose screw or a worn joint lets the actuator move by twice the play before it takes along what
 the sensor looks at. That opens any loop by the same amount, minor loops most of all.
 
-Plays in series with the actuator: friction in its guide holds some of the displacement back.
-
+Plays in series are friction in the actuator's guide, which holds some of the displacement back.
 Where a backlash is one gap, a guide or a glued joint slips bit by bit: each bit follows only once
 the displacement has gone far enough. Loops open, all the more the longer they are.
 """

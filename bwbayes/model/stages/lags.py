@@ -1,14 +1,12 @@
 """Stages that come late: first-order lags, and a pure delay.
 
-First-order lags of an amplifier behind its command and of a sensor behind the displacement.
+An amplifier is behind its command, and a sensor behind the displacement, τ y′ + y = x. The
+actuator's own lag is a part of its dynamics; a slow amplifier stands before the hysteresis, which
+then sees a voltage that is smoother than the command, and a slow sensor, with its filter, behind
+everything.
 
-Both are first-order, τ y′ + y = x. The actuator's own lag is a part of its dynamics; a slow
-amplifier stands before the hysteresis, which then sees a voltage that is smoother than the command,
-and a slow sensor, with its filter, behind everything.
-
-A column of the record that is late: the displacement behind the voltage, or the voltage itself.
-
-Each channel of an instrument has its own latency, and files are put together from channels by rows.
+A delay is a column of the record that is late, the displacement or the voltage. Each channel of an
+instrument has its own latency, and files are put together from channels by rows.
 """
 
 from __future__ import annotations
