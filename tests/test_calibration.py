@@ -101,7 +101,7 @@ def test_five_hundred_replicates_pass_and_find_small_defects() -> None:
 
 
 def test_white_noise_model_fails_the_bands() -> None:
-    """It takes the discrepancy of the same records for sensor noise, as five of them show."""
+    """It takes the discrepancy of the same records for sensor noise, as eight of them show."""
     common = experiment(problem(fixed=("lag", "beta")))
     right = common.posterior
     names = (*right.single_record.actuator.parameters, "sensor_sd")
@@ -111,7 +111,7 @@ def test_white_noise_model_fails_the_bands() -> None:
         prior=JointPrior(p for p in right.prior.parameters if p.name in names),
         joint=None,
     )
-    outcome = made(replace(common, posterior=white, source=right), 5)
+    outcome = made(replace(common, posterior=white, source=right), 8)
     off = errors_off(outcome)
     for kind in ("parameter", "displacement"):
         assert off[f"{kind} 95"] < -LIMIT

@@ -45,7 +45,6 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import generator
 from bwbayes.record import read_record, write_record
-from bwbayes.watching import Watch
 from tests.app import small
 from tests.measured import keep
 
@@ -390,7 +389,7 @@ def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def best_draw(
-    posterior: Posterior, generator: np.random.Generator, _: Watch
+    posterior: Posterior, generator: np.random.Generator, *_: object
 ) -> pointfit.MAPEstimate:
     """Stand in for the point fit, with its error for priors that the record contradicts."""
     prior = posterior.prior
