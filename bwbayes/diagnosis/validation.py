@@ -277,7 +277,7 @@ def validate_bands(
         )
     elif better is not None:
         parts = any(explanation.spec is not None for explanation in better_models(explanations))
-        remedy = '; stages = "auto" adds it' if parts else ""
+        remedy = '; stages = "auto" looks for it' if parts else ""
         doubts.insert(
             0, f"a better model is known ({better.kind}, {rounded(better.nats)} nats){remedy}"
         )

@@ -406,7 +406,7 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
                 nats=20.0,
                 spec=ModelSpec().with_stages("creep"),
             ),
-            'a better model is known (creep, 20 nats); stages = "auto" adds it',
+            'a better model is known (creep, 20 nats); stages = "auto" looks for it',
         ),
         (Explanation("backlash", "backlash", "tighten it", nats=LIMIT - 0.1), None),
         (Explanation("noise by speed", "noise", "do", nats=500.0, noise=True), None),
@@ -453,7 +453,7 @@ def test_one_of_several_that_tie_can_be_added_where_it_is_a_stage() -> None:
     )
     assert verdict is not None
     assert verdict.reasons == (
-        'a better model is known (sensor lag or delay, 22 nats); stages = "auto" adds it',
+        'a better model is known (sensor lag or delay, 22 nats); stages = "auto" looks for it',
     )
 
 
