@@ -322,7 +322,7 @@ class ResidualAnalysis:
         return float(-0.5 * (np.sum(np.log(sensor)) + residual.size) - now)
 
     @cached_property
-    def path_worth(self) -> float:
+    def path_error_gain(self) -> float:
         """Expected gain in log likelihood, nats, if the voltage's path were known exactly.
 
         A stage in front of the hysteresis may gain as much by smoothing the path's error alone. It
@@ -461,7 +461,7 @@ class ResidualAnalysis:
             f"{text}{sighting.note}",
             fix,
             fit,
-            sighting.cost + (self.path_worth if smooths else 0.0),
+            sighting.cost + (self.path_error_gain if smooths else 0.0),
             shift=compared._shift(fit),
             spec=spec,
             stated=stated,

@@ -187,7 +187,7 @@ class Bands:
     models differ on this drive than in training, um; None of a drive like those of training, and
     where the model's error does not follow the drive. Where the sensor's scale is unsure,
     ``read_sds`` are the sds, um, that the parameter and displacement bands have without that.
-    ``scores`` hold the bands against the readings; None until they are :meth:`judged`.
+    ``scores`` compare the bands with the readings; None until :meth:`with_scores` adds them.
     """
 
     __repr__ = brief
@@ -308,7 +308,7 @@ class Bands:
         )
         return covered
 
-    def judged(self, full: float) -> Self:
+    def with_scores(self, full: float) -> Self:
         """Return the bands with their scores if they have readings; ``full`` as in `score`."""
         if not self.scored(self.measured).any():
             return self

@@ -227,7 +227,7 @@ def predict_another(
     beyond = beyond_training(run.study.posterior, other.record.inputs)
     bands = _of_another(run, run.subset, other, name, beyond, part(watch, 0.0, 0.8))
     verdict = validate_bands(bands, run.background, beyond=beyond)
-    bands = bands.judged(run.background.extent)
+    bands = bands.with_scores(run.background.extent)
     from_rest_note = _from_rest_remark(run, other, bands, beyond)
     watch(1.0)
     noise = other.record.path.remark or planned_noise(other.record)
@@ -399,7 +399,7 @@ def predictions(run: Run, watch: Watch = unwatched, *, training: bool = True) ->
             beyond, predicting = run.extrapolations[name], next(watches)
             bands.append(_of_another(run, run.subset, held_out, name, beyond, predicting))
     watch(1.0)
-    return tuple(predicted.judged(run.background.extent) for predicted in bands)
+    return tuple(predicted.with_scores(run.background.extent) for predicted in bands)
 
 
 def _of_another(
