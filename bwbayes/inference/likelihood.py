@@ -96,9 +96,9 @@ class Readings:
 def batches(models: int, samples: int, elements: int = 1 << 23) -> Iterator[slice]:
     """Cut a number of models into batches of so many elements, by default what memory holds.
 
-    A batch has 64 at most, or what 16,384 elements hold: enough to share what is done once for all.
+    A batch has 64 at most, or what a megabyte holds: enough to share what is done once for all.
     """
-    size = min(max(elements // samples, 1), max(64, (1 << 14) // samples))
+    size = min(max(elements // samples, 1), max(64, (1 << 17) // samples))
     return (slice(i, min(i + size, models)) for i in range(0, models, size))
 
 
