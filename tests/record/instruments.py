@@ -293,6 +293,27 @@ _text(
     [f",{row}," for row in _rows(COLUMNS[1:], ",")],
     (named("2", "3"), BOTH, 200.0),
 )
+_text(
+    "recorder, settings above fields that begin with a separator, with dates and units",
+    [
+        *('"Header Size",  16,', '"TraceName","CH1","CH2",', '"BlockSize",600,600,'),
+        *('"VUnit","V","V",', '"SampleRate",200,200,', '"HResolution",5.0e-03,5.0e-03,'),
+        *('"HOffset",-3.0,-3.0,', '"HUnit","s","s",', '"DisplayBlockSize",600,600,'),
+        *('"DisplayPointNo.",1,1,', '"PhaseShift",0,0,', '"Date","2026/03/03","2026/03/03",'),
+        *('"Time","11:59:59.00","11:59:59.00",', ""),
+    ],
+    [f",{row}," for row in _rows(COLUMNS[1:], ",")],
+    (named("2", "3"), BOTH, 200.0),
+)
+_text(
+    "Fortran, a header in capitals behind an exclamation mark",
+    [" !   TIME(S)       VOLT(V)      DISP(UM)"],
+    [
+        "".join(f"{value:16.8E}".replace("E", "D") for value in row)
+        for row in zip(*COLUMNS, strict=True)
+    ],
+    file="a.out",
+)
 
 _MOMENTS = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(np.rint(1e3 * TIME), unit="ms")
 _text(

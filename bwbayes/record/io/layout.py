@@ -35,6 +35,7 @@ _NUMBER = re.compile(
     r"|[+-]?nan|[+-]?inf",
     re.IGNORECASE,
 )
+_DATE = re.compile(r"\d+[/.:-]\d+[/.:-]\d+")
 SEPARATORS = ("\t", ";", ",", "|", " ")
 EXAMPLE = "time_s,voltage_V,displacement_um"
 
@@ -96,10 +97,12 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         cells = cells_of(line, separator)
         numbers = {c for c in columns if c < len(cells) and _NUMBER.fullmatch(cells[c])}
         is_row = len(numbers) > len(columns) / 2 and numbers.issuperset(whole_columns)
-        # Settings may stand before the first numbers, in lines as long as the others.
-        is_row &= len(cells) >= fields or not any("".join(cells[c : c + 1]) for c in empty_columns)
+        # Settings may stand before the first numbers, in lines as long as the others; numbers of
+        # settings stand above other lines of them.
+        has_setting = any("".join(cells[c : c + 1]) for c in empty_columns)
+        is_row &= len(cells) >= fields or not has_setting
         in_a_row = [*in_a_row, index] if is_row else []
-        if len(in_a_row) == 3:
+        if len(in_a_row) >= 3 and not has_setting:
             break
     if not in_a_row:
         raise NoNumbersError(f"{path}: no columns of numbers in it; write {EXAMPLE} above such")
@@ -155,6 +158,8 @@ def find_header(
                     f"{layout.fields // 2} columns; separate them by semicolons, or write 1.5"
                 )
             continue
+        if re.fullmatch("h(orizontal)?[ _]?units?", cells[0].lower()):  # not the channels'
+            continue
         bare = [cell.strip("[]() ") for cell in cells]
         # Times of day have their form in place of a unit.
         stated = [cell for cell, value in zip_longest(bare, values, fillvalue="") if cell and value]
@@ -206,7 +211,8 @@ def split_header(line: str, layout: Layout) -> list[str]:
     """
     if line.startswith("# ") and line[2:].partition(":")[0] in NOTES:
         return []
-    bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
+    # Fortran programs comment by an exclamation mark, MATLAB by a percent sign.
+    bare = re.sub(r"^ *[#%!]+", "", line).strip(" ") if re.match(" *[#%!]", line) else line
     ways = [cells_of(bare, separator) for separator in (layout.separator, *SEPARATORS)]
     between_names = (r"\s{2,}|\t", r"(?<=[\])])\s+", r"\s+(?![\[(/])(?<!/ )")
     ways += [re.split(pattern, bare.strip()) for pattern in between_names]
@@ -217,7 +223,7 @@ def split_header(line: str, layout: Layout) -> list[str]:
         filled = [cell for i, cell in enumerate(cells) if i not in layout.empty]
         # A rule of dashes, as below the names of tables that are drawn, is none.
         is_name = any(re.search(r"\w", cell) for cell in filled)
-        is_name &= not any(_NUMBER.fullmatch(cell) for cell in filled)
+        is_name &= not any(_NUMBER.fullmatch(cell) or _DATE.match(cell) for cell in filled)
         if len(cells) >= needed and not more and is_name:
             return cells
     return []

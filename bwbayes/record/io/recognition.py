@@ -130,6 +130,9 @@ def unit_in(name: str, quantity: str) -> str | None:
         is_marked = ending is not None and name[: ending.start(2)].rstrip().endswith("/")
         if power_of(unit, quantity) is None and not is_marked:
             return None
+    # A header in capitals, as of a Fortran program, has units in capitals.
+    if name.isupper() and quantity != "voltage" and unit_scale(unit.lower(), quantity):
+        return unit.lower()
     return unit if unit_scale(unit, quantity) else None
 
 
@@ -227,7 +230,9 @@ def bare_name(label: str, quantity: str) -> str:
     # A minus before brackets is part of the name, as in V- [V].
     between = r"(?:[\s_/.]|\s-)*[\[(]\s*|[\s_/.-]+"
     return (
-        re.sub(rf"(?:{between}){re.escape(unit)}[\])\s_]*$", "", label).strip() if unit else label
+        re.sub(rf"(?i:(?:{between}){re.escape(unit)}[\])\s_]*$)", "", label).strip()
+        if unit
+        else label
     )
 
 
