@@ -522,8 +522,11 @@ def other_scores_table(
     return Table("scores", "Other scores", columns, rows, records=records)
 
 
-def budget_table(budgets: Sequence[Budget], on: Target = "page") -> Table:
-    """Return a table of the sources' shares in the variance of some quantities, by columns."""
+def budget_table(budgets: Sequence[Budget], on: Target = "page", *, totals: bool = True) -> Table:
+    """Return a table of the sources' shares in the variance of some quantities, by columns.
+
+    Rows of ``totals``, mean, uncertainty and interval, stand below.
+    """
     rows = [
         [
             source,
@@ -533,11 +536,12 @@ def budget_table(budgets: Sequence[Budget], on: Target = "page") -> Table:
         for source, kind in TYPES.items()
         if any(source in budget.shares for budget in budgets)
     ]
-    for words, value in (("Mean", "mean"), ("Standard uncertainty", "sd")):
-        values = [f"{digits(getattr(b, value), b.sd)} {unit_text(b.unit)}" for b in budgets]
-        rows.append([words, "", *values])
-    intervals = [f"{digits(b.lower, b.sd)} to {digits(b.upper, b.sd)}" for b in budgets]
-    rows.append(["95% interval", "", *intervals])
+    if totals:
+        for words, value in (("Mean", "mean"), ("Standard uncertainty", "sd")):
+            values = [f"{digits(getattr(b, value), b.sd)} {unit_text(b.unit)}" for b in budgets]
+            rows.append([words, "", *values])
+        intervals = [f"{digits(b.lower, b.sd)} to {digits(b.upper, b.sd)}" for b in budgets]
+        rows.append(["95% interval", "", *intervals])
     records = [
         {"quantity": b.name, "source": s, "share": v} for b in budgets for s, v in b.shares.items()
     ]

@@ -163,6 +163,7 @@ def test_certificate_says_what_was_stated_and_found(
     assert 0 == said.status
     numbers = json.loads((tmp_path / "run/certificate/certificate.json").read_text())
     found = {quantity["name"]: quantity for quantity in numbers["quantities"]}
+    assert found.keys() >= {budget["quantity"] for budget in numbers["uncertainty_budget"]}
     d = both[1].summary.loc["d"]
     assert (d["lower_95"], d["upper_95"]) == pytest.approx(
         (found["d"]["lower_95"], found["d"]["upper_95"]), rel=1e-9
@@ -176,6 +177,7 @@ def test_certificate_says_what_was_stated_and_found(
     page = (tmp_path / "run/certificate/certificate.html").read_text(encoding="utf-8")
     for text in ("stack &lt;7&gt;", "dh = α du", "JCGM 101", "for drives like", "known to 2 %"):
         assert text in page
+    assert "Standard uncertainty" not in page  # of fewer draws, beside the estimates
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
 
 

@@ -139,7 +139,7 @@ class Certificate(Product):
             blocks=[
                 Facts([*self.stated.items()]),
                 self._table(),
-                budget_table(self.budgets),
+                budget_table(self.budgets, totals=False),
                 Glossary(
                     [
                         *(("model", text) for text in self.equations),
@@ -263,7 +263,10 @@ def _equations(fit: Run) -> list[str]:
 
 
 def _estimates(fit: Run) -> list[dict[str, Any]]:
-    """Return the actuator's free parameters, the major loop's measures, and the displacement."""
+    """Return the actuator's free parameters, the major loop's measures, and what has a budget.
+
+    A parameter's budget is from fewer draws than its estimate, so that the estimate stands.
+    """
     actuators = {p.name for p in fit.result.free if p.declared.scope == "actuator"}
     physical = actuators & {*fit.study.posterior.table.physical}
     estimates = [
@@ -276,8 +279,10 @@ def _estimates(fit: Run) -> list[dict[str, Any]]:
         if measured is not None:
             words, unit = MEASURES[name]
             estimates.append({"name": f"loop: {words.lower()}", "unit": unit, **measured.numbers})
-    last = fit.uncertainty_budgets[-1]
-    estimates.append({"name": last.name, **last.numbers})
+    named = {estimate["name"] for estimate in estimates}
+    for one in fit.uncertainty_budgets:
+        if one.name not in named:
+            estimates.append({"name": one.name, **one.numbers})
     for estimate in estimates:
         half = (estimate["upper_95"] - estimate["lower_95"]) / 2
         estimate["expanded_uncertainty"] = half
