@@ -4,11 +4,11 @@ Elsewhere hypothesis looks for new ones in every run, and keeps those that fail 
 The tests of the whole come first: they take longest, and no worker shall end with one alone. Before
 them come the tools, which need nothing compiled: while one worker checks types, another compiles.
 Rooms whose files take a second or two come last, so that all workers end at about the same time.
-Commands of other processes take this checkout too, and what is compiled of it, not an installation.
 """
 
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -24,7 +24,10 @@ from tests.programs import REQUIRED, VARIABLE
 # As the command line does: what is compiled here makes as many objects that stay.
 gc.set_threshold(50_000)
 
+# Commands of other processes find the checkout, and its bytecode, which is a third of their start.
 os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 settings.register_profile(
     "busy", deadline=None, max_examples=20, derandomize=os.environ.get(VARIABLE) == REQUIRED

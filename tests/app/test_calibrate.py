@@ -105,15 +105,6 @@ def line_ends(whole: Path) -> list[int]:
     return [result.end() for result in re.finditer(b"\n", content)]
 
 
-def test_a_calibration_tells_what_share_of_its_figures_is_drawn(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(whole, tmp_path / "again")
-    steps = Steps.of_commands(monkeypatch)
-    resume(CalibrationFolder.open(tmp_path / "again"), small.quiet(), workers=1)
-    steps.require("figures")
-
-
 def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
     result = json.loads((whole / "calibration.json").read_text())
     assert (True, False, 3, [], 12) == tuple(
@@ -146,10 +137,15 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
         assert text in page
 
 
-def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
+def test_more_replicates_can_be_asked_for(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It tells what share of its figures is drawn."""
     folder = cut(whole, tmp_path / "a", line_ends(whole)[2])
     folder.replicates.write_bytes(folder.replicates.read_bytes().replace(b's":3', b's":2'))
+    steps = Steps.of_commands(monkeypatch)
     assert 3 == resume(folder, small.quiet(), workers=1, replicates=3).replicates
+    steps.require("figures")
     request, *lines = (whole / "replicates.jsonl").read_bytes().splitlines()
     written = folder.replicates.read_bytes().splitlines()
     assert lines == [line for line in written if b"number" in line]

@@ -60,12 +60,6 @@ def test_help_explains_every_option() -> None:
                 assert (option.help or "").endswith("."), f"{name} {option.opts}"
 
 
-def test_python_runs_the_package_as_the_command() -> None:
-    typed = [sys.executable, "-m", "bwbayes", "--version"]
-    done = subprocess.run(typed, capture_output=True, text=True, check=True)
-    assert re.fullmatch(r"bwbayes, version \d+\.\d+\.\d+\n", done.stdout)
-
-
 @pytest.mark.parametrize("command", ["models", "compare"])
 def test_help_lists_every_part_of_a_model(bwbayes: Type, command: str) -> None:
     # A long name may go on in the next line, after its hyphen.
@@ -291,21 +285,6 @@ def test_record_that_goes_the_other_way_ends_with_status_3(
     assert "Likely cause: reversed sign of the displacement. Fix: change" in said.out
     result = json.loads((tmp_path / "bands.json").read_text())
     assert (False, "sign") == (result["passed"], result["cause"])
-
-
-def test_a_files_own_columns_are_recognized(
-    bwbayes: Type, run: Path, record: Record, tmp_path: Path
-) -> None:
-    assert record.displacement is not None
-    rows = zip(1e3 * record.time, record.voltage, record.displacement, strict=True)
-    lines = ["# voltage: command", "t [ms],drive (V),pos_um"]
-    lines += [f"{t:.9g},{v:.12g},{y:.12g}" for t, v, y in rows]
-    (tmp_path / "sine.csv").write_text("\n".join(lines) + "\n")
-    said = bwbayes("predict", run, "--record", "sine.csv", "--from-rest", "--out", "bands.csv")
-    assert 0 == said.status
-    result = json.loads((tmp_path / "bands.json").read_text())
-    assert record.samples == result["samples"]
-    assert result["passed"] in (True, None)
 
 
 def test_the_command_to_copy_has_the_options_that_were_given(bwbayes: Type, tmp_path: Path) -> None:

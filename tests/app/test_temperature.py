@@ -223,16 +223,6 @@ def test_a_model_that_does_not_see_the_temperature_needs_none() -> None:
     assert np.isfinite(command.voltage).all()
 
 
-def test_both_engines_give_one_log_density() -> None:
-    config, records = config_of(TRAINED, {"stages": ["temperature"], "dynamics": "lag"})
-    posterior = resolve_config(config, Path(), records).study.posterior
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 20))
-    one, other = (
-        replace(posterior, engine=engine).log_likelihood(theta) for engine in ("numpy", "numba")
-    )
-    np.testing.assert_allclose(one, other, rtol=1e-10)
-
-
 @pytest.mark.parametrize(
     ("said", "shift"), [('["temperature_degC"]', 0.0), ('{ temperature_degC = "T2" }', 1.0)]
 )

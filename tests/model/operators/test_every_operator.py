@@ -1,7 +1,6 @@
 """What is promised of every operator in the registry, and of one from outside the package."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -254,13 +253,6 @@ def test_sweeps_reach_what_they_say(name: str) -> None:
     assert (end.state <= np.max(ends, axis=0) + slack).all()
 
 
-def test_an_unknown_operator_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(InputError, match="did you mean preisach"):
-        build_part("hysteresis", "presach", HYSTERESIS, {})
-    with pytest.raises(InputError, match="cannot import 'nowhere:Loop'"):
-        build_part("hysteresis", "nowhere:Loop", HYSTERESIS, {})
-
-
 def assert_fitted(of: Posterior) -> None:
     """Fit a simulated record: the mode is at least as probable as the truth."""
     generator = np.random.default_rng(4)
@@ -284,19 +276,3 @@ def test_a_point_fit_asks_for_no_impossible_loop() -> None:
 @every_operator
 def test_every_operator_is_fitted(name: str) -> None:
     assert_fitted(posterior(name))
-
-
-def assert_finite(name: str, draws: int) -> None:
-    of = posterior(name, parts=True)
-    voltage = of.single_record.voltage[::8].copy()
-    displacement = of.single_record.displacement[::8].copy()
-    of = of.altered(voltage=voltage, displacement=displacement, training=(slice(0, voltage.size),))
-    theta = drawn_from(of, draws)
-    for engine in ("numpy", "numba"):
-        density = replace(of, engine=engine).log_likelihood(theta)
-        assert np.isfinite(density).all()
-
-
-@every_operator
-def test_draws_of_the_default_priors_have_a_likelihood(name: str) -> None:
-    assert_finite(name, 100 if name in ("jiles-atherton", "domain-wall") else 1000)
