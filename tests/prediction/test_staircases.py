@@ -112,7 +112,7 @@ def behind_a_play() -> list[Bands]:
     """Predict staircases that begin with a step of 10 V, of one actuator behind a play."""
     case, every = Case(stages=("backlash",), lag=3e-3, discrepancy=0.01), []
     posterior = posterior_of_case(case)
-    draws = np.zeros((DRAWS, posterior.prior.dimensions))
+    draws = np.zeros((DRAWS // 2, posterior.prior.dimensions))
     for seed in range(RECORDS):
         rng = np.random.default_rng(seed)
         levels = np.concatenate([[0.0, 10.0 * rng.choice([-1, 1])], rng.uniform(-90, 90, 7)])
