@@ -355,7 +355,7 @@ def conversion(unit: str, to: str) -> Conversion | None:
         return None
     if match[2] == to.strip():
         return lambda values: factor * values
-    registry: Any = pint.get_application_registry()  # type: ignore[no-untyped-call]
+    registry: Any = pint.get_application_registry()
     (source_unit, size), (target, target_size) = map(_spelled, (match[2], to))
     try:
         source_unit, target = registry.parse_units(source_unit), registry.parse_units(target)
