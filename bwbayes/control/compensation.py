@@ -430,9 +430,9 @@ class Compensation(Product):
 
     @property
     def record(self) -> Record:
-        """The command as a record that a signal generator can play."""
-        name = f"command for {self.reference.name}"
-        return planned(self.voltage, self.reference, self.hold, name, self.conditions)
+        """The command as a record that a signal generator can play; it states its limits."""
+        origin = f"command for {self.reference.name}; amplifier {self.limits}"
+        return planned(self.voltage, self.reference, self.hold, origin, self.conditions)
 
     def records(self) -> dict[str, Record]:
         """Return the command by the name of its file."""

@@ -443,7 +443,9 @@ class Product(Shown):
 
         folder = Path(folder)
         records = {
-            folder / f"{name}.csv": replace(record, quantities=self.quantities)
+            folder / f"{name}.csv": replace(
+                record, quantities=self.quantities, origin=self.quantities.say(record.origin)
+            )
             for name, record in self.records().items()
         }
         pages = [folder / f"{self.NAME}.{kind}" for kind in ("json", "csv", "html")]

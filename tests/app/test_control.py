@@ -37,6 +37,8 @@ def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Run, tmp_path: P
     assert (made.reference.interval, "command") == (record.interval, record.voltage_is)
     numbers = json.loads(files[1].read_text())
     assert made.summary == numbers
+    low, high = (f"{limit:.4g}" for limit in numbers["limits_V"])
+    assert f"amplifier {low} to {high} V, at any speed" in record.origin
     assert numbers["compensated"]["rms_um"]["mean"] < numbers["uncompensated"]["rms_um"]["mean"]
     table = np.genfromtxt(files[2], delimiter=",", names=True)
     np.testing.assert_allclose(table["reference_um"], made.asked, atol=1e-6)
