@@ -323,12 +323,15 @@ def design(
         )
     poles = mean.sections.denominator[0, 0]
 
-    response = draws.frequency_response(ANGLES)
+    def gains_of(speed: float) -> Gains:
+        first, second, third = (speed * poles / poles.sum()).tolist()
+        return Gains((first, second, third), mean.actuator.interval)
+
+    loop = OpenLoop(gains_of(1.0), draws.frequency_response(ANGLES), delay)
 
     def try_speed(speed: float) -> tuple[Gains, Margins]:
-        first, second, third = (speed * poles / poles.sum()).tolist()
-        gains = Gains((first, second, third), mean.actuator.interval)
-        return gains, margins(gains, response, slopes, delay)
+        # A faster controller does what a steeper slope does.
+        return gains_of(speed), loop.margins((speed * slopes[0], speed * slopes[1]))
 
     # An integrator of this speed is at its limit on the steepest slope, whatever the dynamics.
     fastest = 2.0 / float(slopes[1].max())
@@ -350,46 +353,54 @@ def design(
     return best
 
 
-def margins(
-    gains: Gains, response: FloatArray, slopes: tuple[FloatArray, FloatArray], delay: int
-) -> Margins:
-    """Return the margins of draws with a response (draws, angles) and bounds of the slope (draws,).
+class OpenLoop:
+    """The loop L = C(z) z^−delay P(z) of draws, but for the slope of their hysteresis.
 
-    The loop is L = k C(z) z^−delay P(z) with a slope k of the hysteresis, the linear part P and
-    C = (q₀ + q₁/z + q₂/z²) / (1 − 1/z). It is looked at on a grid of angles per sample, rad, and
-    taken to go straight, in log size and angle, from one to the next.
+    ``response`` (draws, angles) is that of the linear part P on a grid of angles per sample, rad;
+    C = (q₀ + q₁/z + q₂/z²) / (1 − 1/z). From one angle to the next L is taken to go straight, in
+    log size and angle.
     """
-    back = np.exp(-1j * ANGLES)
-    controller = np.polyval(gains.steps[::-1], back) / (1 - back) * back**delay
-    loop = controller * response
-    smallest, largest = (slope[:, np.newaxis] for slope in slopes)
-    size, lag = np.abs(loop), np.angle(-loop)
-    with np.errstate(divide="ignore"):
-        log_size = np.log(size)
-    turned = np.angle(loop[:, 1:] / loop[:, :-1])
-    # Gain margin: where the loop is real and negative; at the end it is real but for rounding.
-    real = (loop.real[:, :-1] < 0) & (loop.imag[:, :-1] * loop.imag[:, 1:] <= 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = np.clip(np.nan_to_num(-lag[:, :-1] / turned), 0.0, 1.0)
-        crossings = np.exp(log_size[:, :-1] + fraction * np.diff(log_size, axis=1))
-    worst = np.max(np.where(real, crossings, 0.0), axis=1)
-    worst = np.maximum(worst, np.where(loop.real[:, -1] < 0, size[:, -1], 0.0))
-    with np.errstate(divide="ignore"):
-        gain = 1 / (largest[:, 0] * worst)
-    # Phase margin: where the size is one at some slope. The lag is least at one of these angles,
-    # or at the two ends.
-    between = (size * largest >= 1) & (size * smallest <= 1)
-    smallest_lag = np.min(np.where(between, np.abs(lag), np.pi), axis=1)
-    for slope in (smallest, largest):
-        level = log_size + np.log(slope)
-        crossed = (level[:, :-1] >= 0) != (level[:, 1:] >= 0)
+
+    def __init__(self, gains: Gains, response: FloatArray, delay: int) -> None:
+        back = np.exp(-1j * ANGLES)
+        controller = np.polyval(gains.steps[::-1], back) / (1 - back) * back**delay
+        loop = controller * response
+        self.loop, self.interval = loop, gains.interval
+        self.size, self.lag = np.abs(loop), np.angle(-loop)
+        with np.errstate(divide="ignore"):
+            self.log_size = np.log(self.size)
+        self.turned = np.angle(loop[:, 1:] / loop[:, :-1])
+        # The size where the loop is real and negative; at the end it is real but for rounding.
+        real = (loop.real[:, :-1] < 0) & (loop.imag[:, :-1] * loop.imag[:, 1:] <= 0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            fraction = level[:, :-1] / (level[:, :-1] - level[:, 1:])
-        at_one = np.abs(lag[:, :-1] + fraction * turned)
-        smallest_lag = np.minimum(smallest_lag, np.min(np.where(crossed, at_one, np.pi), axis=1))
-    phase = np.degrees(np.where(gain < 1, -smallest_lag, smallest_lag))
-    circle = np.min(((1 + largest * loop) * np.conj(1 + smallest * loop)).real, axis=1)
-    above = size * largest >= 1
-    last = ANGLES[::-1][np.argmax(above[:, ::-1], axis=1)]
-    crossover = np.where(above.any(axis=1), last, 0.0) / (2 * np.pi * gains.interval)
-    return Margins(gain, phase, crossover, circle)
+            fraction = np.clip(np.nan_to_num(-self.lag[:, :-1] / self.turned), 0.0, 1.0)
+            crossings = np.exp(self.log_size[:, :-1] + fraction * np.diff(self.log_size, axis=1))
+        worst = np.max(np.where(real, crossings, 0.0), axis=1)
+        self.worst = np.maximum(worst, np.where(loop.real[:, -1] < 0, self.size[:, -1], 0.0))
+
+    def margins(self, slopes: tuple[FloatArray, FloatArray]) -> Margins:
+        """Return the margins of k L, where the slope k lies between two bounds (draws,)."""
+        smallest, largest = (slope[:, np.newaxis] for slope in slopes)
+        size, lag = self.size, self.lag
+        with np.errstate(divide="ignore"):
+            gain = 1 / (largest[:, 0] * self.worst)
+        # Phase margin: where the size is one at some slope. The lag is least at one of these
+        # angles, or at the two ends.
+        between = (size * largest >= 1) & (size * smallest <= 1)
+        smallest_lag = np.min(np.where(between, np.abs(lag), np.pi), axis=1)
+        for slope in (smallest, largest):
+            level = self.log_size + np.log(slope)
+            crossed = (level[:, :-1] >= 0) != (level[:, 1:] >= 0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                fraction = level[:, :-1] / (level[:, :-1] - level[:, 1:])
+            at_one = np.abs(lag[:, :-1] + fraction * self.turned)
+            least = np.min(np.where(crossed, at_one, np.pi), axis=1)
+            smallest_lag = np.minimum(smallest_lag, least)
+        phase = np.degrees(np.where(gain < 1, -smallest_lag, smallest_lag))
+        circle = np.min(
+            ((1 + largest * self.loop) * np.conj(1 + smallest * self.loop)).real, axis=1
+        )
+        above = size * largest >= 1
+        last = ANGLES[::-1][np.argmax(above[:, ::-1], axis=1)]
+        crossover = np.where(above.any(axis=1), last, 0.0) / (2 * np.pi * self.interval)
+        return Margins(gain, phase, crossover, circle)

@@ -18,11 +18,11 @@ from bwbayes.control.loop import (
     LoopNoise,
     LoopPlan,
     Margins,
+    OpenLoop,
     Robustness,
     Stand,
     design,
     follow,
-    margins,
 )
 from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.sampled import SampledModel
@@ -219,7 +219,8 @@ def largest_pole(gains: Gains, draws: SampledModel) -> float:
 
 
 def margins_of(gains: Gains, draws: SampledModel, delay: int) -> Margins:
-    return margins(gains, draws.frequency_response(ANGLES), draws.slopes(cases.SPAN), delay)
+    loop = OpenLoop(gains, draws.frequency_response(ANGLES), delay)
+    return loop.margins(draws.slopes(cases.SPAN))
 
 
 def scaled(gains: Gains, factor: float) -> Gains:
