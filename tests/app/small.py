@@ -50,7 +50,7 @@ from_rest = true
 """
 
 
-# The command line in a process of its own, which explains no misfit.
+# The command line in a process of its own, which explains no misfit; and one without pictures too.
 UNEXPLAINED = """
 import pytest
 from bwbayes.app.commands.cli import main
@@ -58,6 +58,7 @@ from tests.app import small
 small.without_explanations(pytest.MonkeyPatch())
 main()
 """
+BLANK = UNEXPLAINED.replace("main()\n", "small.without_pictures(pytest.MonkeyPatch())\nmain()\n")
 
 
 def config(*changes: tuple[str, str], text: str = TEXT) -> Config:

@@ -137,6 +137,7 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
         assert text in page
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_more_replicates_can_be_asked_for(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +186,7 @@ def test_request_to_stop_is_answered_with_how_to_go_on(
     assert_same_end(whole, tmp_path / "a")
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_unconverged_replicates_are_counted_and_end_with_status_four(
     bwbayes: Type, tmp_path: Path
 ) -> None:

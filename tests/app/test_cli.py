@@ -370,8 +370,8 @@ def test_what_nobody_reads_ends_as_a_broken_pipe_does(copy: RunFolder, command: 
 @pytest.mark.usefixtures("_without_pictures", "_without_explanations")
 def test_a_run_behind_head_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(small.TEXT)
-    (tmp_path / "unexplained.py").write_text(small.UNEXPLAINED)
-    command = f"{sys.executable} unexplained.py run small.toml --out run --workers 1 | head -n 1"
+    (tmp_path / "blank.py").write_text(small.BLANK)
+    command = f"{sys.executable} blank.py run small.toml --out run --workers 1 | head -n 1"
     ended = subprocess.run(
         ["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False
     )

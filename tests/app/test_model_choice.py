@@ -60,6 +60,7 @@ def test_a_search_that_adds_many_stages_and_leaves_an_error_has_not_found_the_me
     assert len(chosen.config.records["record"].remarks or []) == 1
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_a_run_adds_a_quadratic_gain_and_says_what_it_is_worth(tmp_path: Path) -> None:
     record = plant("quadratic", (8, 1), 8.0)
     with warnings.catch_warnings(record=True) as caught:
