@@ -288,7 +288,7 @@ def test_a_loop_of_any_quantities_is_run_by_one_line_in_its_own_units(
     loop, quantities = LOOPS[name], Quantities.of(LOOPS[name].input, LOOPS[name].output)
     loop.write(Path("loop.csv"))
     stated = ("--input", loop.input, "--output", loop.output)
-    said = bwbayes("run", "loop.csv", *stated, "--search", "none", "--out", "run")
+    said = bwbayes("run", "loop.csv", *stated, "--search", "none", "--workers", 1, "--out", "run")
     assert (said.status, "no time" in said.out) == (0, loop.interval is None), said
     numbers = json.loads(Path("run/summary.json").read_text(encoding="utf-8"))
     unit = {"d": f"{quantities.say('um/V')}", "beta": f"{quantities.say('1/V')}"}
