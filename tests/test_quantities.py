@@ -1,7 +1,6 @@
 """Input and output of any kind: words, units and conversions, priors, records without a time."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,10 @@ from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.design import RivalDesign, RivalScore
 from bwbayes.diagnosis.validation import ValidationSummary
+from bwbayes.inference.defaults import ranges_of
 from bwbayes.inference.study import every_declaration
-from bwbayes.model.declaration import Context, Distribution, Ranges
-from bwbayes.model.inputs import Limits
+from bwbayes.model.declaration import Context, Distribution
+from bwbayes.model.inputs import Inputs, Limits
 from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.io.columns import conversion
@@ -183,36 +183,31 @@ def test_a_files_note_that_would_be_code_is_none(tmp_path: Path) -> None:
     assert read_record(tmp_path / "loop.csv").quantities == DEFAULT
 
 
-def test_no_default_prior_knows_an_absolute_voltage_or_displacement() -> None:
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 3.0])
+def test_no_default_prior_knows_an_absolute_voltage_or_displacement(exponent: float) -> None:
     """In other units of input and output every default prior is the same one."""
-    ranges = Ranges(
-        voltage=40.0,
-        displacement=30.0,
-        middle=4.0,
-        time=0.5,
-        bias=10.0,
-        interval=0.001,
-        duration=16.0,
-        rounding=0.01,
-        resolution=0.005,
-        covariates={"temperature_degC": (20.0, 30.0), "load_N": (0.0, 5.0)},
-    )
+    voltage, displacement = loop()
+    covariates = {"temperature_degC": 20 + displacement, "load_N": 1 + displacement}
     per_input, per_output = 1e-3, 1e6
-    scaled = replace(ranges, voltage=ranges.voltage * per_input, bias=ranges.bias * per_input)
-    for name in ("displacement", "middle", "rounding", "resolution"):
-        scaled = replace(scaled, **{name: getattr(ranges, name) * per_output})
+    ranges, scaled = (
+        ranges_of(
+            Inputs(own * voltage, interval=0.01, covariates=covariates),
+            np.round(displacement, 6) * times,
+        )
+        for own, times in ((1.0, 1.0), (per_input, per_output))
+    )
     compared = 0
     for declared in every_declaration():
-        stated: dict[str, float | Distribution] = {"exponent": 1.0, "stiffness": 1.0}
+        stated: dict[str, float | Distribution] = {"exponent": exponent, "stiffness": 1.0}
         first, second = (declared.default(Context(r, stated)) for r in (ranges, scaled))
         unit = declared.unit_in(stated)
         if unit in ("kg", "N/m", "N s/m") or isinstance(first, float | None):
             continue
         assert isinstance(second, Distribution)
-        powers = {"um": 0, "V": 0}
+        powers = {"um": 0.0, "V": 0.0}
         for over, name, power in re.findall(r"(/?)(um|V)(?:\^\(?([-\dn]+)\)?)?", unit):
-            powers[name] += (-1 if over else 1) * {"": 1, "1-n": 0, "-n": -1}.get(power, 0)
-            powers[name] += (-1 if over else 1) * int(power) if power.isdecimal() else 0
+            size = {"": 1.0, "1-n": 1 - exponent, "-n": -exponent}.get(power)
+            powers[name] += (-1 if over else 1) * (float(power) if size is None else size)
         factor = per_output ** powers["um"] * per_input ** powers["V"]
         for name, value in first.arguments.items():
             own = value if name in ("sigma", "s") else factor * value

@@ -253,13 +253,6 @@ def test_a_model_that_needs_a_covariate_is_refused_without(tmp_path: Path, stage
         resolve_config(config, tmp_path, records)
 
 
-@pytest.mark.parametrize("suffix", ["h5", "csv", "mat"])
-def test_files_bring_covariates_back(suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"record.{suffix}"
-    bw.write_record(TRAINED, path)
-    assert bw.read_record(path).sha256 == TRAINED.sha256
-
-
 # An actuator that heats itself: no temperature is recorded, and the search finds out
 
 SPEED, WARM_UP = 320.0, 6.0  # V/s that heat by 15 K, and s

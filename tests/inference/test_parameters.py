@@ -333,42 +333,6 @@ def test_scales_of_beta_and_gamma_follow_the_exponent(exponent: float, free: boo
     assert max(shares) < 0.99, shares
 
 
-# Powers of k and m by which a parameter grows if displacements are k and voltages m times as large.
-# With another exponent n, beta and gamma grow by k^(1 - n) / m.
-POWERS = {
-    "d": (1, -1),
-    "alpha": (1, -1),
-    "beta": (0, -1),
-    "gamma": (0, -1),
-    "initial": (1, 0),
-    "offset": (1, 0),
-    "lag": (0, 0),
-    "sensor_sd": (1, 0),
-    "discrepancy_sd": (1, 0),
-    "discrepancy_time": (0, 0),
-}
-
-
-def half_width(name: str, exponent: float, k: float = 1.0, m: float = 1.0) -> float:
-    """Return half of the central 68% of a default prior, given k and m."""
-    voltage = drive()
-    ranges = ranges_of(Inputs(m * voltage, interval=1e-3), k * 0.6 * voltage)
-    low, high = prior(name, ranges, exponent).frozen.ppf([0.16, 0.84])
-    return float(high - low) / 2
-
-
-@pytest.mark.parametrize("exponent", [1.0, 1.5, 3.0])
-@pytest.mark.parametrize("name", POWERS)
-def test_a_default_prior_goes_with_the_units(name: str, exponent: float) -> None:
-    """Within the three digits that a default prior has."""
-    of_k, of_m = map(float, POWERS[name])
-    if name in ("beta", "gamma"):
-        of_k = 1 - exponent
-    for k, m in ((1000.0, 1.0), (1.0, 0.001), (0.03, 7.0)):
-        grown = half_width(name, exponent, k, m) / half_width(name, exponent)
-        np.testing.assert_allclose(k**of_k * m**of_m, grown, rtol=0.01)
-
-
 @given(digits=st.integers(0, 3), scale=st.floats(0.1, 10), seed=st.integers(0, 9))
 def test_readings_without_noise_have_that_of_rounding(digits: int, scale: float, seed: int) -> None:
     """Of q/√12 in multiples of q, of 2⁻²⁴ of the range in others; none is said of noisy readings.

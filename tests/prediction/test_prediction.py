@@ -61,9 +61,14 @@ def draws(posterior: Posterior) -> FloatArray:
 
 
 def predicted(
-    posterior: Posterior, draws: FloatArray, record: Record, start: InitialConditions, seed: int = 3
+    posterior: Posterior,
+    draws: FloatArray,
+    record: Record,
+    start: InitialConditions,
+    window: tuple[float, float] | None = None,
 ) -> Bands:
-    return predict_record(posterior, draws, record, start, np.random.default_rng(seed))
+    rng = np.random.default_rng(3)
+    return predict_record(posterior, draws, record, start, rng, window=window)
 
 
 def width(bands: Bands, kind: Kind = "parameter", level: int = 95) -> FloatArray:
@@ -118,28 +123,14 @@ def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArr
 def test_a_window_of_another_record_is_that_part_of_the_whole(
     posterior: Posterior, draws: FloatArray
 ) -> None:
-    record = made(start=0.4)
-    whole = predicted(posterior, draws, record, InitialConditions(lead_in=1.0))
-    part = predict_record(
-        posterior,
-        draws,
-        record,
-        InitialConditions(lead_in=1.0),
-        np.random.default_rng(3),
-        window=(3.0, 7.0),
-    )
+    record, start = made(start=0.4), InitialConditions(lead_in=1.0)
+    whole = predicted(posterior, draws, record, start)
+    part = predicted(posterior, draws, record, start, (3.0, 7.0))
     assert (100, 0) == (whole.scored_from, part.scored_from)
     for (name, expected), (_, got) in zip(whole.columns(), part.columns(), strict=True):
         np.testing.assert_allclose(expected[300:700], got, atol=1e-9, err_msg=name)
     with pytest.raises(InputError, match="lead-in leaves nothing of the window"):
-        predict_record(
-            posterior,
-            draws,
-            record,
-            InitialConditions(lead_in=1.0),
-            np.random.default_rng(3),
-            window=(0.0, 0.5),
-        )
+        predicted(posterior, draws, record, start, (0.0, 0.5))
 
 
 def test_missing_readings_are_not_judged_and_bands_go_on(
