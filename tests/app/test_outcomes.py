@@ -58,16 +58,6 @@ def test_run_without_convergence_speaks_of_no_interval(cut_short: tuple[RunFolde
     assert not list((made.path / "figures").glob("co*"))  # corner, coverage
 
 
-def test_one_that_is_interrupted_is_said_to_be_not_finished(
-    cut_short: tuple[RunFolder, int], bwbayes: Type, tmp_path: Path
-) -> None:
-    path = tmp_path / "interrupted"
-    shutil.copytree(cut_short[0].path, path)
-    (path / "summary.json").unlink()
-    said = bwbayes("predict", str(path), "--signal", "step50")
-    said.assert_refused(f"is not finished; resume with `bwbayes resume {path}`")
-
-
 def test_line_on_the_screen_says_what_to_do(
     cut_short: tuple[RunFolder, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
