@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -61,40 +62,6 @@ DISCREPANCY_TIME = Declaration(
     lambda context: lognormal(0.5 * context.ranges.time, 0.8),
     floor=0.0,
 )
-# Up to 1/√2 the spectrum, ∝ 1/((ω² − ω₀²)² + ω² ω₀²/Q²), has no peak. A process that resonates has
-# hardly any power at low frequencies, so that a slow misfit would be taken for the parameters'.
-# Were 1/2 the most, low ones would be extrapolated from high ones, the more the finer a record is
-# sampled.
-DISCREPANCY_QUALITY = Declaration(
-    "discrepancy_quality",
-    "",
-    "Q",
-    "quality of the model discrepancy, 0.5 for Matérn 3/2, less if it is rougher",
-    lambda _: Distribution("uniform", {"lower": 0.0, "upper": math.sqrt(0.5)}),
-    floor=0.0,
-    pressed={"upper": "try other parts of the model; what it misses oscillates"},
-)
-# Uniform, so that neither a normal distribution (0) nor a Cauchy (1) is far from anything.
-SENSOR_TAIL = Declaration(
-    "sensor_tail",
-    "",
-    r"1/\nu",
-    "1 over the degrees of freedom of the sensor noise, 0 if it is normal",
-    lambda _: Distribution("uniform", {"lower": 0.0, "upper": 1.0}),
-    floor=0.0,
-    pressed={"upper": "find out what spoils so many readings; a loose contact, a lost bit"},
-)
-
-SENSOR_SPEED = Declaration(
-    "sensor_speed",
-    "V/s",
-    "v_s",
-    "speed of the voltage at which the sensor's noise has twice its variance at rest",
-    # The mean speed of a triangle over the range; noise that does not grow lies far above it.
-    lambda context: lognormal(2 * context.ranges.voltage / context.ranges.time, 1.5),
-    floor=0.0,
-)
-
 # The integral over a time, by Gauss and Legendre, where the fast rate times it is below one.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 
@@ -103,15 +70,8 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 class WhiteNoise(Noise):
     """Sensor noise alone, independent normal errors of sd s. Right only if the model is."""
 
-    @property
-    def declarations(self) -> tuple[Declaration, ...]:
-        """The sensor's sd."""
-        return (SENSOR_SD,)
-
-    @property
-    def observe(self) -> FloatArray:
-        """No state."""
-        return np.zeros(0)
+    declarations: ClassVar[tuple[Declaration, ...]] = (SENSOR_SD,)
+    observe: ClassVar = np.zeros(0)
 
     def stationary(self, theta: FloatArray) -> FloatArray:
         """Return the covariance of no state."""
@@ -158,15 +118,20 @@ class StudentNoise(WhiteNoise):
     doi:10.1080/01621459.1989.10478852.
     """
 
-    @property
-    def declarations(self) -> tuple[Declaration, ...]:
-        """The size of the sensor's noise, and one over its degrees of freedom."""
-        return (SENSOR_SD, SENSOR_TAIL)
-
-    @property
-    def tailed(self) -> bool:
-        """It is."""
-        return True
+    declarations: ClassVar = (
+        SENSOR_SD,
+        # Uniform, so that neither a normal distribution (0) nor a Cauchy (1) is far from anything.
+        Declaration(
+            "sensor_tail",
+            "",
+            r"1/\nu",
+            "1 over the degrees of freedom of the sensor noise, 0 if it is normal",
+            lambda _: Distribution("uniform", {"lower": 0.0, "upper": 1.0}),
+            floor=0.0,
+            pressed={"upper": "find out what spoils so many readings; a loose contact, a lost bit"},
+        ),
+    )
+    tailed: ClassVar = True
 
     def inverse_df(self, theta: FloatArray) -> FloatArray:
         """Return 1/ν."""
@@ -181,15 +146,19 @@ class PacedNoise(WhiteNoise):
     discrepancy it is ``"discrepancy + paced"``.
     """
 
-    @property
-    def declarations(self) -> tuple[Declaration, ...]:
-        """The sensor's sd at rest, and the speed that doubles its variance."""
-        return (SENSOR_SD, SENSOR_SPEED)
-
-    @property
-    def paced(self) -> bool:
-        """It is."""
-        return True
+    declarations: ClassVar = (
+        SENSOR_SD,
+        Declaration(
+            "sensor_speed",
+            "V/s",
+            "v_s",
+            "speed of the voltage at which the sensor's noise has twice its variance at rest",
+            # The mean speed of a triangle over the range; noise that does not grow lies far above.
+            lambda context: lognormal(2 * context.ranges.voltage / context.ranges.time, 1.5),
+            floor=0.0,
+        ),
+    )
+    paced: ClassVar = True
 
     def sensor_variance(self, theta: FloatArray, speed: FloatArray) -> FloatArray:
         """Return s² (1 + (v / v_s)²)."""
@@ -210,15 +179,8 @@ class DiscrepancyNoise(Noise):
     823-841 (1930), doi:10.1103/PhysRev.36.823.
     """
 
-    @property
-    def declarations(self) -> tuple[Declaration, ...]:
-        """Sds of sensor and discrepancy, and the discrepancy's correlation time."""
-        return (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME)
-
-    @property
-    def observe(self) -> FloatArray:
-        """The only state."""
-        return np.ones(1)
+    declarations: ClassVar = (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME)
+    observe: ClassVar = np.ones(1)
 
     def stationary(self, theta: FloatArray) -> FloatArray:
         """Return σ²."""
@@ -267,10 +229,23 @@ class SmoothNoise(Noise):
     series, The Astronomical Journal 154, 220 (2017), doi:10.3847/1538-3881/aa9332.
     """
 
-    @property
-    def declarations(self) -> tuple[Declaration, ...]:
-        """Sds of sensor and discrepancy, the discrepancy's correlation time and quality."""
-        return (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME, DISCREPANCY_QUALITY)
+    declarations: ClassVar = (
+        *DiscrepancyNoise.declarations,
+        # Up to 1/√2 the spectrum, ∝ 1/((ω² − ω₀²)² + ω² ω₀²/Q²), has no peak. A process that
+        # resonates has hardly any power at low frequencies, so that a slow misfit would be taken
+        # for the parameters'. Were 1/2 the most, low ones would be extrapolated from high ones, the
+        # more the finer a record is sampled.
+        Declaration(
+            "discrepancy_quality",
+            "",
+            "Q",
+            "quality of the model discrepancy, 0.5 for Matérn 3/2, less if it is rougher",
+            lambda _: Distribution("uniform", {"lower": 0.0, "upper": math.sqrt(0.5)}),
+            floor=0.0,
+            pressed={"upper": "try other parts of the model; what it misses oscillates"},
+        ),
+    )
+    observe: ClassVar = np.array([1.0, 0.0])
 
     def for_new_readings(self, theta: FloatArray, missed: Callable[[], float]) -> FloatArray:
         """Take the discrepancy's size from the residuals, not from the kernel.
@@ -282,11 +257,6 @@ class SmoothNoise(Noise):
         sized = theta.copy()
         sized[:, 1] = np.sqrt(np.maximum(missed() - theta[:, 0] ** 2, 0.0))
         return sized
-
-    @property
-    def observe(self) -> FloatArray:
-        """The first state."""
-        return np.array([1.0, 0.0])
 
     def stationary(self, theta: FloatArray) -> FloatArray:
         """Return σ² times the unit matrix."""

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
@@ -404,26 +404,16 @@ class SumNoise(Noise):
 
     def stationary(self, theta: FloatArray) -> FloatArray:
         """Return the covariances of all terms along the diagonal."""
-        return _along_diagonal(
-            [term.stationary(columns_of_term) for term, columns_of_term in self._split(theta)]
-        )
+        return self._along_diagonal(theta, lambda term, columns: term.stationary(columns))
 
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
         """Return the transitions of all terms along the diagonal."""
-        return _along_diagonal(
-            [
-                term.transition(columns_of_term, readings)
-                for term, columns_of_term in self._split(theta)
-            ]
-        )
+        return self._along_diagonal(theta, lambda term, columns: term.transition(columns, readings))
 
     def process_covariance(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
         """Return the process covariances of all terms along the diagonal."""
-        return _along_diagonal(
-            [
-                term.process_covariance(columns_of_term, readings)
-                for term, columns_of_term in self._split(theta)
-            ]
+        return self._along_diagonal(
+            theta, lambda term, columns: term.process_covariance(columns, readings)
         )
 
     def correlation_time(self, theta: FloatArray) -> FloatArray:
@@ -448,17 +438,18 @@ class SumNoise(Noise):
             yield term, np.concatenate([theta[:, :1], theta[:, first:last]], axis=1)
             first = last
 
-
-def _along_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Return matrices (..., states, states) with blocks (..., own, own) along their diagonal."""
-    size = sum(block.shape[-1] for block in blocks)
-    matrices = np.zeros((*blocks[0].shape[:-2], size, size))
-    first = 0
-    for block in blocks:
-        last = first + block.shape[-1]
-        matrices[..., first:last, first:last] = block
-        first = last
-    return matrices
+    def _along_diagonal(
+        self, theta: FloatArray, block_of: Callable[[Noise, FloatArray], FloatArray]
+    ) -> FloatArray:
+        """Return matrices (..., states, states) with a block of each term along their diagonal."""
+        blocks = [block_of(*term) for term in self._split(theta)]
+        matrices = np.zeros((*blocks[0].shape[:-2], self.states, self.states))
+        first = 0
+        for block in blocks:
+            last = first + block.shape[-1]
+            matrices[..., first:last, first:last] = block
+            first = last
+        return matrices
 
 
 def root(covariance: FloatArray) -> FloatArray:
