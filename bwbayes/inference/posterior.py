@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,17 +26,6 @@ from bwbayes.shown import brief
 
 # Normal scores of the priors' models, 97% of them, whose readings are fitted.
 FARTHEST_FOLLOWED = 2.2
-
-
-class RecordView(NamedTuple):
-    """One of a posterior's records: its own posterior, and its parameters of some draws.
-
-    ``draws`` are (draws, free of that posterior), parameters in their own units.
-    """
-
-    name: str
-    posterior: Posterior
-    draws: FloatArray
 
 
 @dataclass(frozen=True)
@@ -286,8 +275,11 @@ class Posterior:
         columns_of: FloatArray = draws[..., columns]
         return columns_of
 
-    def each(self, draws: FloatArray) -> Iterator[RecordView]:
-        """Yield the records one by one, with their parameters of draws (draws, free)."""
+    def each(self, draws: FloatArray) -> Iterator[tuple[str, Posterior, FloatArray]]:
+        """Yield each record's name, its own posterior, and its parameters of draws (draws, free).
+
+        These are (draws, free of that posterior), in their own units.
+        """
         for dataset in self.datasets:
             name = dataset.name
-            yield RecordView(name, self.for_record(name), self.select_draws(draws, name))
+            yield name, self.for_record(name), self.select_draws(draws, name)

@@ -397,21 +397,18 @@ def finish(path: Path, *, quiet: bool, **options: Any) -> int:
     return fit.standing.exit_status
 
 
-# Keywords with another name there.
-OTHERWISE = {"fit": "run", "folder": "out", "displacement_file": "displacement"}
-
-
 def as_typed(text: str) -> str:
     """Return a text with what is in backticks, arguments and calls, as it is typed in a shell."""
+    names = {"fit": "run", "folder": "out", "displacement_file": "displacement"}
     arguments = r"\w+=[^\s,]+(?:, \w+=[^\s,]+)*"
     pattern = rf"`(?:bwbayes\.(?P<call>fit|resume)\((?P<inside>[^`]*)\)|(?P<alone>{arguments}))`"
 
     def typed(code: re.Match[str]) -> str:
         call = code["call"]
-        words = [f"bwbayes {OTHERWISE.get(call, call)}"] if call else []
+        words = [f"bwbayes {names.get(call, call)}"] if call else []
         for argument in (code["alone"] or code["inside"]).split(", "):
             name, sign, value = argument.rpartition("=")
-            words += [f"--{OTHERWISE.get(name, name)}".replace("_", "-")] if sign else []
+            words += [f"--{names.get(name, name)}".replace("_", "-")] if sign else []
             words += [value.strip("'\"")] if value != "True" else []
         return f"`{' '.join(words)}`"
 

@@ -32,6 +32,8 @@ from bwbayes.sampling.chain import PHASES, ChainFile, draws, log_densities
 from bwbayes.watching import Watch, WatchSteps, parts, unwatched, watched
 
 if TYPE_CHECKING:
+    from tempfile import TemporaryDirectory
+
     import xarray
 
     from bwbayes.app.config.config import Config
@@ -44,7 +46,7 @@ if TYPE_CHECKING:
         track as track_fit,
     )
     from bwbayes.app.jobs.design import design as design_fit
-    from bwbayes.app.jobs.fit_methods import Scratch, fit_method
+    from bwbayes.app.jobs.fit_methods import fit_method
     from bwbayes.app.jobs.predict import Prediction, predict as predict_record
     from bwbayes.app.running.workers import FigureWorker
     from bwbayes.arrays import FloatArray
@@ -93,7 +95,7 @@ class Run(Shown):
     folder: RunFolder = field(default_factory=lambda: RunFolder(Path(os.devnull)))
     seconds: float = 0.0
     watch: WatchSteps = unwatched
-    _scratch: Scratch | None = None
+    _scratch: TemporaryDirectory[str] | None = None
 
     def with_cache(self, **results: object) -> Self:
         """Return this run with attributes that are there already, computed ones too."""

@@ -29,7 +29,7 @@ from bwbayes.app.config.proposal import draft_config
 from bwbayes.app.fit.fitted import Run, open_finished
 from bwbayes.app.jobs.predict import Prediction, predict_another
 from bwbayes.app.running.fingerprint import fingerprint
-from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
+from bwbayes.app.running.folder import CampaignFolder, Origin, RunFolder
 from bwbayes.app.running.progress import LastLine, StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
@@ -82,9 +82,6 @@ STATUSES = {
     "validation inconclusive": ExitStatus.VALIDATION_INCONCLUSIVE,
     "passed": ExitStatus.SUCCESS,
 }
-
-# File in a run's folder with the numbers that a population needs.
-SPECIMEN = "specimen.npz"
 
 
 @dataclass(frozen=True)
@@ -153,7 +150,7 @@ class Campaign(Product):
         )
         names = [row.name for row in rows if row.parameters]
         specimens = [
-            Specimen.load(name, folder.run(name) / SPECIMEN)
+            Specimen.load(name, folder.specimen(name))
             for name in watched(names, partial(watch, "draws"))
         ]
         if len(specimens) < FEWEST:
@@ -541,7 +538,7 @@ def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
     written if the campaign has pictures. Returns the file, "refused", "not converged" or "", and
     why it was refused.
     """
-    origin, run = campaign.origin(), campaign.run(file.stem)
+    origin = campaign.origin()
     console = LastLine(campaign.progress(file.stem))
     with warnings.catch_warnings():
         # They are the run's remarks, and a hundred records of one kind say the same.
@@ -558,8 +555,8 @@ def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
                 specimen = specimen_of(
                     file.stem, fit.study.posterior, fit.flat_draws, source, instruments
                 )
-                specimen.save(run / SPECIMEN)
-            (run / ENDED).write_text(ended(digests, run), encoding="utf-8")
+                specimen.save(campaign.specimen(file.stem))
+            campaign.mark_done(file.stem, digests)
             return file, "" if fit.converged else "not converged", ""
         except InputError as error:
             # The name of a file in the folder of the records is enough.

@@ -292,10 +292,6 @@ def _estimates(fit: Run) -> list[dict[str, Any]]:
     return [{key: estimate[key] for key in kept} for estimate in estimates]
 
 
-# Samples that are simulated at once.
-PIECE = 400
-
-
 def run_budgets(run: Run) -> tuple[Budget, ...]:
     """Return the budgets of a run from half of its draws as the readings have them."""
     study, draws, predictions = run.study, run.subset[::2], run.predictions
@@ -347,7 +343,7 @@ def _displacement(run: Run, draws: FloatArray, bands: Bands) -> Measurand:
 
     def values(of: InitialStates) -> FloatArray:
         last = np.empty(0)
-        for simulated in of.pieces(inputs, PIECE):
+        for simulated in of.pieces(inputs, 400):  # samples that are simulated at once
             last = simulated[:, -1]
         return last - of.mean_offset
 

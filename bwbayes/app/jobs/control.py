@@ -149,10 +149,10 @@ def compensate(
     options = {name: value for name, value in options.items() if value is not None}
     read_as = next(iter(fit.config.records.values())).read_as
     desired = _reference(reference, study.record.interval, options, read_as, reading)
-    alone = next(iter(study.posterior.each(fit.flat_draws)))
+    _, alone, of_record = next(study.posterior.each(fit.flat_draws))
     command_from = partial(
         compensated,
-        alone.posterior,
+        alone,
         reference=desired,
         command=command,
         hold=parse_hold(hold),
@@ -162,14 +162,14 @@ def compensate(
         conditions=conditions_at(study, at, beyond_training=beyond_training),
         instruments=study.record.instruments,
     )
-    draws, source = thin_draws(alone.draws, study.generator("draws")), f"compensate {desired.name}"
+    draws, source = thin_draws(of_record, study.generator("draws")), f"compensate {desired.name}"
     compensation = command_from(
         draws=draws,
         generator=study.generator(source),
         from_rest=from_rest,
         watch=partial(watch, "predicted error"),
     )
-    extrapolations = extrapolation.beyond_training(alone.posterior, compensation.record.inputs)
+    extrapolations = extrapolation.beyond_training(alone, compensation.record.inputs)
     remarks = [*compensation.remarks, *(finding.note for finding in extrapolations)]
     if not from_rest:
         # A voltage that exists from some states need not exist from rest.

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-import tempfile
 import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from inspect import signature
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Concatenate
 
 import numpy as np
@@ -129,20 +129,16 @@ def conditions_at(
     return conditions
 
 
-class Scratch:
-    """A temporary folder that is removed when nobody needs it any more."""
-
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
-        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
-
-
-def folder_or_scratch(folder: str | Path | None, name: str) -> tuple[Path, Scratch | None]:
+def folder_or_scratch(
+    folder: str | Path | None, name: str
+) -> tuple[Path, TemporaryDirectory[str] | None]:
     """Return a user's folder, or without one a temporary one and what keeps it there."""
     if folder is not None:
         return Path(folder), None
-    scratch = Scratch()
-    return scratch.path / name, scratch
+    # Its own clean-up warns where it is not asked for.
+    scratch = TemporaryDirectory(prefix="bwbayes-", delete=False)
+    weakref.finalize(scratch, shutil.rmtree, scratch.name, ignore_errors=True)
+    return Path(scratch.name) / name, scratch
 
 
 def console_of(progress: bool) -> Console:

@@ -252,6 +252,10 @@ class CampaignFolder(Folder):
         """Return the folder of a record's run."""
         return self.path / "records" / name
 
+    def specimen(self, name: str) -> Path:
+        """Return the file with the numbers of a record's run that a population needs."""
+        return self.run(name) / "specimen.npz"
+
     def progress(self, name: str) -> Path:
         """Return the file that says what a record's run is at, as long as it is fitted."""
         return self.path / f".{name}.progress"
@@ -322,18 +326,18 @@ class CampaignFolder(Folder):
 
     def is_done(self, file: Path) -> bool:
         """Tell whether a record's run has ended, and is about the files as they are now."""
-        run = self.run(file.stem)
         try:
-            return (run / ENDED).read_text(encoding="utf-8") == ended(self.digests(file), run)
+            mark = (self.run(file.stem) / "ended.json").read_text(encoding="utf-8")
+            return mark == self._ended(file.stem, self.digests(file))
         except (OSError, UnicodeError):
             return False
 
+    def mark_done(self, name: str, digests: Mapping[str, str]) -> None:
+        """Note that a record's run has ended, and the digests of the files that it is about."""
+        mark = self._ended(name, digests)
+        (self.run(name) / "ended.json").write_text(mark, encoding="utf-8")
 
-# File that a run's folder has once the run came to its end.
-ENDED = "ended.json"
-
-
-def ended(digests: Mapping[str, str], run: Path) -> str:
-    """Return what the folder of a run that ended says: digests of its files and summary, JSON."""
-    summary = sha256((run / "summary.json").read_bytes()).hexdigest()
-    return json.dumps({**digests, "summary": summary})
+    def _ended(self, name: str, digests: Mapping[str, str]) -> str:
+        """Return the digests of a run that ended with that of its summary, JSON."""
+        summary = sha256((self.run(name) / "summary.json").read_bytes()).hexdigest()
+        return json.dumps({**digests, "summary": summary})

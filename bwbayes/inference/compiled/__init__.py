@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = ["products", "warm_up", "whiten"]
 
-# Largest number of noise states that the lanes hold; :mod:`whitening` filters noise with more.
-LANE_STATES = 2
-
 
 def warm_up(posterior: Posterior) -> None:
     """Simulate and whiten one model, to compile functions that :func:`products` does not need.
@@ -56,8 +53,9 @@ def products(
     """
     actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
     readings, is_known = likelihood.readings, displacement is not None
-    # If readings are few, a pass over all samples takes longer than whitening the readings.
-    if noise.states > LANE_STATES or (is_known and 2 * readings.rows.size < readings.samples):
+    # The lanes hold two states of the noise; :mod:`whitening` filters noise with more. If readings
+    # are few, a pass over all samples takes longer than whitening the readings.
+    if noise.states > 2 or (is_known and 2 * readings.rows.size < readings.samples):
         return likelihood.products_of_series(theta, np.empty((0, readings.rows.size)), displacement)
     record = RecordArrays(likelihood.inputs_read.voltage, likelihood.values, gaps)
     column = likelihood.table.columns(theta)

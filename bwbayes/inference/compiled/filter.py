@@ -30,9 +30,9 @@ Each = Annotated[FloatArray, (SERIES,)]
 Matrix = Annotated[FloatArray, (2, 2)]
 
 # Where products of innovations are, by the indices of their series.
-ORDER = np.arange(SERIES)
-HIGH = np.maximum.outer(ORDER, ORDER)
-PAIR = HIGH * (HIGH + 1) // 2 + np.minimum.outer(ORDER, ORDER)
+PAIR = np.array(
+    [[max(i, j) * (max(i, j) + 1) // 2 + min(i, j) for j in range(SERIES)] for i in range(SERIES)]
+)
 
 
 class Transition(Struct):
