@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine
 from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import draws, log_densities, thinning
 from bwbayes.sampling.diagnostics import check

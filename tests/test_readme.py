@@ -15,7 +15,7 @@ import pytest
 
 from bwbayes import read_record
 from bwbayes.app.commands import cli
-from bwbayes.app.config.settings import SamplingConfig
+from bwbayes.app.config.config import SamplingConfig
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.declaration import Context, Distribution, Ranges
 from bwbayes.model.operators.bouc_wen import BoucWen

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.config.config import load
-from bwbayes.app.config.settings import RecordConfig
+from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray

@@ -31,8 +31,7 @@ from bwbayes.diagnosis.rivals import DRAWS, Rival, close_rivals
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.likelihood import batches
-from bwbayes.inference.linearization import value_and_jacobian
-from bwbayes.inference.mode_finding import Target
+from bwbayes.inference.mode_finding import Target, value_and_jacobian
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import InitialConditions, Study
 from bwbayes.model.inputs import Limits

@@ -27,8 +27,8 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.inference.linearization import value_and_jacobian
 from bwbayes.inference.map_estimate import MAPEstimate
+from bwbayes.inference.mode_finding import value_and_jacobian
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior

@@ -21,9 +21,8 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
-from bwbayes.inference import heavy_tails
+from bwbayes.inference import Engine, heavy_tails
 from bwbayes.inference.defaults import rounding_sd
-from bwbayes.inference.engine import Engine
 from bwbayes.inference.heavy_tails import Followed
 from bwbayes.inference.parameters import ParameterTable
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
@@ -165,7 +164,7 @@ class Likelihood:
     name
         Name of the record.
     engine
-        Engine; see :mod:`bwbayes.inference.engine`.
+        Engine; see :mod:`bwbayes.inference`.
     offset_sd
         Prior sd of an offset of the record's own beside that of θ, um; zero if it has none.
     half_range

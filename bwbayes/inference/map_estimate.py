@@ -21,8 +21,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
-from bwbayes.inference.linearization import value_and_jacobian
-from bwbayes.inference.mode_finding import Mode, Target, climb, refine
+from bwbayes.inference.mode_finding import Mode, Target, climb, refine, value_and_jacobian
 from bwbayes.inference.thinning import beginning, thin_posterior, with_residuals_of
 from bwbayes.model.stages.lags import TIME_CONSTANTS
 from bwbayes.shown import brief

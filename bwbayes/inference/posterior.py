@@ -19,7 +19,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine
 from bwbayes.inference.likelihood import Likelihood, Score, batches
 from bwbayes.inference.parameters import JointPrior, ParameterTable
 from bwbayes.shown import brief

@@ -21,8 +21,8 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
+from bwbayes.inference import Engine
 from bwbayes.inference.defaults import join_ranges, ranges_of
-from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.inference.parameters import Column, JointPrior, Parameter, ParameterTable

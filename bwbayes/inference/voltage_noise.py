@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.linearization import value_and_jacobian
 from bwbayes.inference.map_estimate import MAPEstimate
+from bwbayes.inference.mode_finding import value_and_jacobian
 from bwbayes.inference.posterior import Posterior
 from bwbayes.record.voltage_path import VoltagePath
 from bwbayes.watching import Watch, unwatched, watched

@@ -29,7 +29,7 @@ from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.loops import driven, measures, steady_loop
-from bwbayes.prediction.mixture import stratified_scores
+from bwbayes.prediction.prediction import stratified_scores
 from bwbayes.record.instruments import Instruments, Scales
 
 NOISE, MODEL, STATE = "readings' noise", "model error", "initial state"

@@ -356,18 +356,8 @@ STEP_MEASURES: Mapping[str, tuple[str, str]] = {
 
 
 @dataclass(frozen=True)
-class Step:
-    """A step of the voltage from zero to ``height``, V, that is held for ``held``, s."""
-
-    __repr__ = brief
-
-    height: float
-    held: float
-
-
-@dataclass(frozen=True)
 class StepResponse:
-    """The posterior of a step response.
+    """The posterior of the response to a step from zero to ``height``, V, ``held`` so long, s.
 
     ``time`` (times,), s since the step; ``response`` the displacement since then, um; ``crept`` its
     growth from 0.1 s on, um, nan before, and None without creep. The names in ``estimates`` are
@@ -376,7 +366,8 @@ class StepResponse:
 
     __repr__ = brief
 
-    step: Step
+    height: float
+    held: float
     time: FloatArray
     response: Curve
     crept: Curve | None
@@ -385,12 +376,15 @@ class StepResponse:
     @property
     def numbers(self) -> dict[str, object]:
         """Its numbers in ``summary.json``."""
-        levels: dict[str, object] = {"height_V": self.step.height, "held_s": self.step.held}
+        levels: dict[str, object] = {"height_V": self.height, "held_s": self.held}
         return levels | {n: None if e is None else e.numbers for n, e in self.estimates.items()}
 
 
-def step_of(record: Record) -> Step | None:
-    """Return the step from zero that a record's voltage is, or None if it is something else."""
+def step_of(record: Record) -> tuple[float, float] | None:
+    """Return height, V, and length, s, of the step from zero that a record's voltage is.
+
+    None if it is something else.
+    """
     voltage = record.path.voltage
     height = float(np.median(voltage[voltage.size // 2 :]))
     slack = 0.02 * abs(height)
@@ -399,7 +393,7 @@ def step_of(record: Record) -> Step | None:
     # One sample may lie on the way.
     if not (slack > 0 and up[first:].all() and np.abs(voltage[: max(first - 1, 1)]).max() <= slack):
         return None
-    return Step(height, (record.samples - first) * record.interval)
+    return height, (record.samples - first) * record.interval
 
 
 def measure_steps(
@@ -413,13 +407,17 @@ def measure_steps(
     ``scales`` are as of :func:`measure_step`.
     """
     steps = {name: step_of(record) for name, record in records.items()}
-    return {n: measure_step(posterior, draws, step, scales) for n, step in steps.items() if step}
+    return {n: measure_step(posterior, draws, *step, scales) for n, step in steps.items() if step}
 
 
 def measure_step(
-    posterior: Posterior, draws: FloatArray, step: Step, scales: Scales | None = None
+    posterior: Posterior,
+    draws: FloatArray,
+    height: float,
+    held: float,
+    scales: Scales | None = None,
 ) -> StepResponse:
-    """Measure the response to a step.
+    """Measure the response to a step to ``height``, V, that is ``held`` so long, s.
 
     With x(t) the displacement since the step, x_d(t) that without creep, x_∞ where x_d settles, and
     c(t) = x(t) − x_d(t):
@@ -444,9 +442,9 @@ def measure_step(
     column |= {"initial": np.zeros(len(draws)), "offset": np.zeros(len(draws))}
     actuator = replace(single.likelihood.actuator, hold="zero")
     first = 1e-6  # s: shorter than any rise
-    held = max(step.held, 10 * first)
-    time = np.geomspace(first, held, round(60 * np.log10(held / first)) + 1)
-    settled, without, creep = _responses(actuator, column, step.height, time)
+    last = max(held, 10 * first)
+    time = np.geomspace(first, last, round(60 * np.log10(last / first)) + 1)
+    settled, without, creep = _responses(actuator, column, height, time)
     estimates: dict[str, Estimate | None] = dict.fromkeys(STEP_MEASURES)
     estimates["level_um"] = Estimate.of(um * settled)
     if actuator.filter.parameters:
@@ -458,16 +456,15 @@ def measure_step(
         overshoot = 100 * np.maximum(np.max(share, axis=1) - 1, 0.0)
         estimates["overshoot_percent"] = Estimate.of(overshoot)
     crept = None
-    if actuator.creep is not None and held >= 10 * CREEP_FROM:
+    if actuator.creep is not None and last >= 10 * CREEP_FROM:
         before = np.array([np.interp(np.log(CREEP_FROM), np.log(time), row) for row in creep])
         grown = creep - before[:, np.newaxis]
-        decades = np.log10(held / CREEP_FROM)
+        decades = np.log10(last / CREEP_FROM)
         percent = 100 * grown[:, -1] / (settled + before) / decades
         estimates["creep_percent"] = Estimate.of(percent)
         crept = Curve.of(np.where(time < CREEP_FROM, np.nan, um[:, np.newaxis] * grown))
-    return StepResponse(
-        step, time, Curve.of(um[:, np.newaxis] * (without + creep)), crept, estimates
-    )
+    response = Curve.of(um[:, np.newaxis] * (without + creep))
+    return StepResponse(height, held, time, response, crept, estimates)
 
 
 def _responses(

@@ -46,7 +46,7 @@ UNKNOWN = "–"
 Target = Literal["both", "page", "screen", "nowhere"]
 Kind = Literal["good", "note", "bad"]
 
-type Block = Table | Picture | Facts | Text | Glossary | Section | SideBySide
+type Block = Table | Picture | Facts | Text | Section | SideBySide
 
 
 @dataclass(frozen=True)
@@ -140,11 +140,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Facts:
-    """Subjects with a text each: a table of two columns."""
-
-    kind: ClassVar = "facts"
+    """Subjects with a text each: a table of two columns, or terms and their meanings, or notes."""
 
     pairs: Sequence[tuple[str, str]]
+    kind: Literal["facts", "terms", "notes"] = "facts"
 
 
 @dataclass(frozen=True)
@@ -156,16 +155,6 @@ class Text:
     text: str
     note: bool = False
     on: Target = "page"
-
-
-@dataclass(frozen=True)
-class Glossary:
-    """Terms and their meanings, in small letters."""
-
-    kind: ClassVar = "glossary"
-
-    pairs: Sequence[tuple[str, str]]
-    note: bool = True
 
 
 @dataclass(frozen=True)

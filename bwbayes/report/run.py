@@ -29,7 +29,6 @@ from bwbayes.report.report import (
     Banner,
     Block,
     Facts,
-    Glossary,
     Report,
     Section,
     SideBySide,
@@ -129,8 +128,8 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
             cause = Markup("<br>Likely cause: {}.<br>Fix: {}.")
             why += cause.format(verdict.cause.text, verdict.cause.fix)
         explained.append((verdict.where, why))
-    glossary = Glossary(explained, note=False)
-    blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), glossary]
+    terms = Facts(explained, "terms")
+    blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), terms]
     (on_screen,) = standing_banner(standing, on="screen")
     return [replace(on_screen, items=(), blocks=blocks, on="page"), on_screen]
 
@@ -232,7 +231,7 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
                 "Other scores",
                 [
                     other_scores_table(scores, titles, records),
-                    Glossary([*SCORE_TERMS.items()]),
+                    Facts([*SCORE_TERMS.items()], "notes"),
                 ],
             ),
         ]
@@ -243,7 +242,7 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
         measured = loops_table(result.loops)
         rows = [row[0] for row in measured.rows]
         terms = [pair for pair in LOOP_TERMS.items() if any(r.startswith(pair[0]) for r in rows)]
-        loops: list[Block] = [measured, pictures["loops"], Glossary(terms)]
+        loops: list[Block] = [measured, pictures["loops"], Facts(terms, "notes")]
         blocks.append(Section("Loops", loops, folded=False))
     if result.uncertainty_budgets:
         budget: list[Block] = [budget_table(result.uncertainty_budgets)]
@@ -576,7 +575,7 @@ def loops_table(loops: Loops) -> Table:
 def steps_table(steps: Mapping[str, StepResponse]) -> Table:
     """Return a table of the measures of the steps."""
     estimates = {
-        f"{name}: {response.step.height:.4g} V for {response.step.held:.4g} s": response.estimates
+        f"{name}: {response.height:.4g} V for {response.held:.4g} s": response.estimates
         for name, response in steps.items()
     }
     note = (

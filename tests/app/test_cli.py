@@ -381,7 +381,7 @@ def test_a_run_behind_head_is_resumed(tmp_path: Path) -> None:
 
 
 def test_numba_may_be_switched_off() -> None:
-    script = "from bwbayes.inference.engine import resolve_engine; print(resolve_engine())"
+    script = "from bwbayes.inference import resolve_engine; print(resolve_engine())"
     assert python("-c", script, NUMBA_DISABLE_JIT="1").stdout == "numpy\n"
     script = script.replace("resolve_engine()", "resolve_engine('numba')")
     assert "NUMBA_DISABLE_JIT is set" in python("-c", script, NUMBA_DISABLE_JIT="1").stderr

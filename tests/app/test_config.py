@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from bwbayes.app.config.config import Config, dump, is_config, load, parse
+from bwbayes.app.config.config import Config, ModelConfig, dump, is_config, load, parse
 from bwbayes.app.config.keys import ANY, Key, keys
 from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.config.reference import PARTS, config_reference, parts_reference
-from bwbayes.app.config.settings import ModelConfig
 from bwbayes.errors import InputError
 from bwbayes.record.record import Record
 

@@ -25,8 +25,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.running.workers import one_thread, open_executor, side_by_side
 from bwbayes.errors import InputError
-from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine, map_estimate as pointfit
 from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import init_chain, sample

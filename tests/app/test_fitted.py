@@ -13,8 +13,7 @@ from hypothesis import given, strategies as st
 
 import bwbayes as bw
 from bwbayes.app.commands.cli import cli
-from bwbayes.app.config.config import load, parse
-from bwbayes.app.config.settings import StandConfig
+from bwbayes.app.config.config import StandConfig, load, parse
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.campaign import Row
 from bwbayes.app.running import run

@@ -21,7 +21,7 @@ from bwbayes.app.running.run import resume
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.calibration.calibration import replicate
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine
 from bwbayes.record import Record, write_record
 from bwbayes.report.figures import pictures
 from tests.app import small

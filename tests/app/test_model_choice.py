@@ -16,8 +16,7 @@ from hypothesis import given, strategies as st
 from rich.console import Console
 
 import bwbayes as bw
-from bwbayes.app.config.config import Config, dump, parse
-from bwbayes.app.config.settings import RecordConfig
+from bwbayes.app.config.config import Config, RecordConfig, dump, parse
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running import explaining
 from bwbayes.app.running.explaining import chosen_noise, search_stages

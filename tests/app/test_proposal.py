@@ -17,9 +17,8 @@ from hypothesis import given
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.config.config import dump, load, parse
+from bwbayes.app.config.config import RecordConfig, dump, load, parse
 from bwbayes.app.config.proposal import ConfigProposal, draft_config
-from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.study.about import findings_of

@@ -26,8 +26,7 @@ from bwbayes.calibration.calibration import (
     smooth_test,
 )
 from bwbayes.errors import InputError
-from bwbayes.inference import map_estimate
-from bwbayes.inference.engine import resolve_engine
+from bwbayes.inference import map_estimate, resolve_engine
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.study import InitialConditions, Validation
 from bwbayes.model.actuator import Actuator

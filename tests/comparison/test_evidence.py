@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from bwbayes.app.config.config import load
-from bwbayes.app.config.settings import RecordConfig
+from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.running.workers import one_thread
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray, IntArray

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.config.config import Config, parse
-from bwbayes.app.config.settings import ParameterConfig
+from bwbayes.app.config.config import Config, ParameterConfig, parse
 from bwbayes.app.running.explaining import explain_record
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.residual_analysis import Explanation

@@ -17,9 +17,8 @@ from hypothesis import example, given, settings, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import compiled, engine
+from bwbayes.inference import compiled, engine, resolve_engine, stopwatch
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.inference.engine import resolve_engine, stopwatch
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.registry import HYSTERESIS
 from tests.inference.problems import short_posterior, truth

@@ -17,8 +17,7 @@ from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import heavy_tails, map_estimate
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine, heavy_tails, map_estimate
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.posterior import Posterior

@@ -14,8 +14,7 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine, map_estimate as pointfit
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
 from bwbayes.inference.outliers import outliers, surprise

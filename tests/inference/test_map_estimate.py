@@ -12,10 +12,16 @@ from scipy.signal import lfilter
 
 from bwbayes.app.config.config import parse
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.engine import Engine
-from bwbayes.inference.linearization import STEP, gradient_and_hessian, value_and_jacobian
+from bwbayes.inference import Engine
 from bwbayes.inference.map_estimate import LeastSquares, MAPEstimate, fit, mode_weights
-from bwbayes.inference.mode_finding import Target, climb, refine
+from bwbayes.inference.mode_finding import (
+    STEP,
+    Target,
+    climb,
+    gradient_and_hessian,
+    refine,
+    value_and_jacobian,
+)
 from bwbayes.inference.posterior import Posterior
 from tests.diagnosis.plants import bench
 from tests.diagnosis.test_fixes import CONFIG, put

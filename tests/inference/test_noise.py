@@ -17,7 +17,7 @@ from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine
 from bwbayes.inference.likelihood import Readings
 from bwbayes.inference.noise import (
     DISCREPANCY_SD,

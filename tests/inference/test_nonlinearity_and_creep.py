@@ -9,8 +9,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine, map_estimate as pointfit
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep

@@ -16,8 +16,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.engine import resolve_engine
+from bwbayes.inference import map_estimate as pointfit, resolve_engine
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.linear import CASES, Linear, Normal, every_case

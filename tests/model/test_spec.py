@@ -5,7 +5,7 @@ import json
 import pytest
 from hypothesis import given, strategies as st
 
-from bwbayes.app.config.settings import ModelConfig
+from bwbayes.app.config.config import ModelConfig
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.nonlinearity import TERMS

@@ -7,7 +7,7 @@ from scipy.stats import norm, t
 
 from bwbayes.arrays import FloatArray, Floating
 from bwbayes.inference.heavy_tails import scale_mixture, scale_of
-from bwbayes.prediction.mixture import (
+from bwbayes.prediction.prediction import (
     crps,
     log_density,
     quantile,

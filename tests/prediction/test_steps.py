@@ -10,7 +10,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Span
 from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.prediction.loops import Estimate, Step, measure_step, measure_steps, step_of
+from bwbayes.prediction.loops import Estimate, measure_step, measure_steps, step_of
 from bwbayes.prediction.prediction import forecast
 from bwbayes.record.record import Record
 from bwbayes.record.waveforms import signal
@@ -26,8 +26,8 @@ def problem(actuator: Actuator, **fixed: float) -> tuple[Posterior, FloatArray]:
     return of, of.prior.draw(np.random.default_rng(1), 40)
 
 
-def measured(of: Posterior, draws: FloatArray, step: Step) -> dict[str, Estimate]:
-    every = measure_step(of, draws, step).estimates.items()
+def measured(of: Posterior, draws: FloatArray, height: float, held: float) -> dict[str, Estimate]:
+    every = measure_step(of, draws, height, held).estimates.items()
     return {name: estimate for name, estimate in every if estimate is not None}
 
 
@@ -43,7 +43,7 @@ def test_a_lag_rises_in_log_nine_times_its_time_and_does_not_overshoot(height: f
     lags = of.table.columns(of.prior.theta(draws))["lag"]
     slow = (lags > 1e-4) & (lags < 1)  # inside of the times that are looked at
     assert np.sum(slow) > 20
-    got = measured(of, draws[slow], Step(height, 20.0))
+    got = measured(of, draws[slow], height, 20.0)
     rise, overshoot, settled = (got[n] for n in ("rise_s", "overshoot_percent", "level_um"))
     expected = np.log(9) * lags[slow]
     assert np.mean(expected) == pytest.approx(rise.mean, rel=1e-3)
@@ -61,7 +61,7 @@ def test_a_light_damping_overshoots_as_the_text_book_says() -> None:
     damping = 2 * ratio * np.sqrt(mass * stiffness)
     actuator = Actuator("second-order", "zero", INTERVAL)
     of, draws = problem(actuator, mass=mass, stiffness=stiffness, damping=damping)
-    overshoot = measured(of, draws, Step(50.0, 1.0))["overshoot_percent"]
+    overshoot = measured(of, draws, 50.0, 1.0)["overshoot_percent"]
     expected = 100 * np.exp(-np.pi * ratio / np.sqrt(1 - ratio**2))
     assert expected == pytest.approx(overshoot.mean, rel=2e-3)
 
@@ -71,8 +71,8 @@ def test_creep_is_the_sum_of_its_lags() -> None:
     actuator = Actuator("lag", "first", INTERVAL, creep=Creep(times))
     known = {f"creep_{i + 1}": c for i, c in enumerate(strengths)}
     of, draws = problem(actuator, lag=1e-3, **known)
-    got = measure_step(of, draws, Step(50.0, 10.0))
-    creep = measured(of, draws, Step(50.0, 10.0))["creep_percent"]
+    got = measure_step(of, draws, 50.0, 10.0)
+    creep = measured(of, draws, 50.0, 10.0)["creep_percent"]
 
     def crept(t: float) -> float:
         return float(sum(-c * np.expm1(-t / T) for c, T in zip(strengths, times, strict=True)))
@@ -92,7 +92,7 @@ def test_a_gain_counts_from_the_displacement_before_the_step() -> None:
     of, draws = problem(
         Actuator("lag", "first", INTERVAL, nonlinearity=nonlinearity), quadratic=3.0
     )
-    settled = measured(of, draws, Step(50.0, 5.0))["level_um"]
+    settled = measured(of, draws, 50.0, 5.0)["level_um"]
     added = 3.0 * ((50 - 40) ** 2 - 40**2) / 60**2
     assert level(50.0) + added == pytest.approx(settled.mean)
 

@@ -12,8 +12,7 @@ import pytest
 import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.inference import map_estimate
-from bwbayes.inference.engine import resolve_engine
+from bwbayes.inference import map_estimate, resolve_engine
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator

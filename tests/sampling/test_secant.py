@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.engine import resolve_engine
+from bwbayes.inference import resolve_engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.sampling.plan import SamplingPlan

@@ -22,9 +22,15 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from bwbayes.app.config.config import ALONE, Config, validated_config
+from bwbayes.app.config.config import (
+    ALONE,
+    Config,
+    ModelConfig,
+    RecordConfig,
+    SamplingConfig,
+    validated_config,
+)
 from bwbayes.app.config.keys import one_line, synonyms
-from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
 from bwbayes.inference.state_space import Noise

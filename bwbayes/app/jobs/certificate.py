@@ -46,7 +46,6 @@ from bwbayes.prediction.loops import MEASURES
 from bwbayes.report.report import (
     Banner,
     Facts,
-    Glossary,
     Product,
     Report,
     Table,
@@ -140,13 +139,14 @@ class Certificate(Product):
                 Facts([*self.stated.items()]),
                 self._table(),
                 budget_table(self.budgets, totals=False),
-                Glossary(
+                Facts(
                     [
                         *(("model", text) for text in self.equations),
                         *(("validated", text) for text in self.validated),
                         *(("limits of use", text) for text in self.limits),
                         *self.facts.items(),
-                    ]
+                    ],
+                    "notes",
                 ),
                 Text("Issued by (name, date, signature): ________________________________"),
             ],

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from bwbayes.app.config.config import Config
-from bwbayes.app.config.settings import ModelConfig
+from bwbayes.app.config.config import Config, ModelConfig
 from bwbayes.app.fit.fitted import Run, open_finished
 from bwbayes.app.jobs.predict import predictions
 from bwbayes.app.running.folder import RunFolder

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from bwbayes.app.config.config import read_toml
+from bwbayes.app.config.config import SignalConfig, read_toml
 from bwbayes.app.config.keys import one_line
-from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import fitted_voltages
 from bwbayes.app.study.from_config import open_like, sampled_waveform

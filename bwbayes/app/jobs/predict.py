@@ -12,7 +12,7 @@ the same record under another name gets the same bands.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise, zip_longest
@@ -27,7 +27,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation
-from bwbayes.diagnosis.rivals import disagreement
+from bwbayes.diagnosis.rivals import Rival, disagreement
 from bwbayes.diagnosis.validation import (
     BandValidation,
     ValidationSummary,
@@ -361,16 +361,11 @@ def predict_after(
     source = study.generator(f"forecast {planned.sha256}")
     alone, own_draws = reaching(study, run.subset, of, longer, beyond)
 
-    error = None
+    def follow(posterior: Posterior, draws: FloatArray, rng: np.random.Generator) -> Bands:
+        return forecast(posterior, draws, record, voltage, rng)
+
     rivals = run.widening_rivals(of, part(watch, 0.0, 0.5)) if beyond else None
-    if rivals is not None:
-        rng = study.generator(f"rivals {planned.sha256}")
-
-        def follow(posterior: Posterior, draws: FloatArray) -> Bands:
-            return forecast(posterior, draws, record, voltage, rng)
-
-        fitted = study.posterior.for_record(of), study.posterior.select_draws(run.subset, of)
-        error = disagreement(*fitted, study.for_record(of), rivals, follow, rng)
+    error = _model_error_sd(study, rivals, run.subset, of, planned, follow)
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     bands = forecast(alone, own_draws, record, voltage, source, name, predicting, error)
     bands = replace(bands, correction=_of_drives_alike(run, held_out, beyond))
@@ -414,21 +409,36 @@ def _of_another(
     study, record = run.study, other.record
     assert record is not None
     alone, own_draws = reaching(study, draws, other.of, record, beyond)
-    error = None
+
+    def follow(posterior: Posterior, draws: FloatArray, rng: np.random.Generator) -> Bands:
+        return predict_record(posterior, draws, record, other.start, rng)
+
     rivals = run.widening_rivals(other.of, part(watch, 0.0, 0.5)) if beyond else None
-    if rivals is not None:
-        rng = study.generator(f"rivals {record.sha256}")
-
-        def predict(posterior: Posterior, draws: FloatArray) -> Bands:
-            return predict_record(posterior, draws, record, other.start, rng)
-
-        fitted = study.posterior.for_record(other.of), study.posterior.select_draws(draws, other.of)
-        error = disagreement(*fitted, study.for_record(other.of), rivals, predict, rng)
+    error = _model_error_sd(study, rivals, draws, other.of, record, follow)
     source = study.generator(f"predict {record.sha256}")
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     return predict_record(
         alone, own_draws, record, other.start, source, name, other.judged, predicting, error
     )
+
+
+def _model_error_sd(
+    study: Study,
+    rivals: Sequence[Rival] | None,
+    draws: FloatArray,
+    of: str,
+    planned: Record,
+    follow: Callable[[Posterior, FloatArray, np.random.Generator], Bands],
+) -> float | None:
+    """Return by how much rivals on a training record differ on a planned one, um; None without.
+
+    ``follow`` predicts the planned record by the posterior of a model and its draws.
+    """
+    if rivals is None:
+        return None
+    rng = study.generator(f"rivals {planned.sha256}")
+    fitted = study.posterior.for_record(of), study.posterior.select_draws(draws, of)
+    return disagreement(*fitted, study.for_record(of), rivals, partial(follow, rng=rng), rng)
 
 
 def reaching(

@@ -26,8 +26,7 @@ from bwbayes.diagnosis.finding import TELLING_DRIVE
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
-from bwbayes.inference import map_estimate
-from bwbayes.inference.engine import stopwatch
+from bwbayes.inference import map_estimate, stopwatch
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
 from bwbayes.inference.posterior import Posterior

@@ -30,11 +30,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.app.config.config import dump
-from bwbayes.app.config.settings import CertificateConfig
+from bwbayes.app.config.config import CertificateConfig, dump
 from bwbayes.app.fit.fitted import Run
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine
+from bwbayes.inference import Engine
 from bwbayes.inference.parameters import COORDINATES
 from bwbayes.inference.state_space import Noise
 from bwbayes.record.io.formats import draft_of

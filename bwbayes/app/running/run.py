@@ -26,7 +26,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import FigureWorker, one_thread, open_executor
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine, resolve_engine
+from bwbayes.inference import Engine, resolve_engine
 from bwbayes.inference.voltage_noise import path_covariance
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.result import render, write_bands, write_summary

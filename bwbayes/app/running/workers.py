@@ -46,7 +46,7 @@ import cloudpickle
 from threadpoolctl import threadpool_limits
 
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.engine import Engine, resolve_engine
+from bwbayes.inference import Engine, resolve_engine
 from bwbayes.watching import Watch, unwatched, watched
 
 if TYPE_CHECKING:

@@ -25,8 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.app.config.config import ALONE, Config
-from bwbayes.app.config.settings import (
+from bwbayes.app.config.config import (
+    ALONE,
+    Config,
     ModelConfig,
     ParameterConfig,
     RecordConfig,
@@ -34,7 +35,7 @@ from bwbayes.app.config.settings import (
     ValidationConfig,
 )
 from bwbayes.errors import ColumnsError, InputError, InputWarning, suggestion
-from bwbayes.inference.engine import resolve_engine
+from bwbayes.inference import resolve_engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import (
     InitialConditions,

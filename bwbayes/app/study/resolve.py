@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bwbayes.app.config.config import ALONE, Config
-from bwbayes.app.config.settings import ModelConfig, ParameterConfig, RecordConfig
+from bwbayes.app.config.config import ALONE, Config, ModelConfig, ParameterConfig, RecordConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.from_config import (
     join_records,

@@ -246,7 +246,7 @@ def draw_steps(responses: Mapping[str, StepResponse]) -> Figure:
     first = np.inf
     for number, (name, response) in enumerate(responses.items()):
         color = style.COLORS[number % len(style.COLORS)]
-        label = style.plain(f"{name}, {response.step.height:g} V")
+        label = style.plain(f"{name}, {response.height:g} V")
         # The rise is drawn from this part of its final value on.
         started = np.abs(response.response.mean) > 1e-3 * abs(float(response.response.mean[-1]))
         # Without dynamics there is no rise to be seen.
@@ -256,7 +256,7 @@ def draw_steps(responses: Mapping[str, StepResponse]) -> Figure:
             if curve is not None:
                 edges = curve.lower, curve.upper
                 style.draw_band(panel, response.time, curve.mean, edges, label, color)
-    last = max(response.step.held for response in responses.values())
+    last = max(response.held for response in responses.values())
     for panel in panels:
         panel.set(xscale="log", xlabel="time since the step (s)", xlim=(CREEP_FROM, last))
     panels[0].set(xlim=(first, last), ylabel="displacement (µm)", title="rise")
