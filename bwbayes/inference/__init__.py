@@ -53,7 +53,7 @@ def stopwatch(engine: Engine) -> Iterator[Callable[[], float]]:
     if engine == "numpy":
         yield lambda: time.process_time() - begin
         return
-    from bwbayes.inference.compiled.caching import compile_time  # noqa: PLC0415  # needs numba
+    from bwbayes.inference.compiled.lanes import compile_time  # noqa: PLC0415  # needs numba
 
     with compile_time() as compiling:
         yield lambda: time.process_time() - begin - compiling.seconds

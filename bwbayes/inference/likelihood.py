@@ -488,9 +488,9 @@ class Likelihood:
         """Filter series as :func:`bwbayes.inference.heavy_tails.follow` does."""
         along = heavy_tails.run
         if self.engine == "numba":
-            from bwbayes.inference.compiled import tails  # noqa: PLC0415  # as for the products
+            from bwbayes.inference.compiled import whitening  # noqa: PLC0415  # as for the products
 
-            along = tails.run
+            along = whitening.run
         skipped = self.readings.skipped
         return heavy_tails.follow(self.spaced, noise, series, start_sd, skipped, along)
 

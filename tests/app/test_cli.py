@@ -392,7 +392,7 @@ def test_without_a_place_for_a_cache_functions_are_compiled_all_the_same() -> No
 import numba.core.caching as caching
 for locator in caching.CacheImpl._locator_classes:
     locator.from_function = classmethod(lambda *_: None)
-from bwbayes.inference.compiled.caching import compile_cached
+from bwbayes.inference.compiled.lanes import compile_cached
 for number in range(2):
     assert compile_cached()(lambda x: x + 1)(number) == number + 1
 """
@@ -402,7 +402,7 @@ for number in range(2):
 
 
 OUTER = """
-from bwbayes.inference.compiled.caching import compile_cached
+from bwbayes.inference.compiled.lanes import compile_cached
 from bwbayes.model.inner import inner
 
 @compile_cached()
@@ -410,7 +410,7 @@ def outer():
     return inner()
 """
 INNER = """
-from bwbayes.inference.compiled.caching import compile_cached
+from bwbayes.inference.compiled.lanes import compile_cached
 
 @compile_cached()
 def inner():

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
 
+from bwbayes import inference
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import compiled, engine, resolve_engine, stopwatch
+from bwbayes.inference import compiled, resolve_engine, stopwatch
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.registry import HYSTERESIS
@@ -206,7 +207,7 @@ def test_engine_is_chosen_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         resolve_engine("numpy"),
         resolve_engine("numba"),
     )
-    monkeypatch.setattr(engine, "find_spec", lambda _: None)
+    monkeypatch.setattr(inference, "find_spec", lambda _: None)
     assert ("numpy", "numpy") == (resolve_engine("auto"), resolve_engine("numpy"))
     with pytest.raises(InputError, match="numba is not installed; pip install numba"):
         resolve_engine("numba")

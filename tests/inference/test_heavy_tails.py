@@ -28,7 +28,7 @@ from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring
 ENGINES: list[Engine] = ["numpy", "numba"] if importlib.util.find_spec("numba") else ["numpy"]
 RUNS = [heavy_tails.run]
 if "numba" in ENGINES:
-    RUNS.append(importlib.import_module("bwbayes.inference.compiled.tails").run)
+    RUNS.append(importlib.import_module("bwbayes.inference.compiled.whitening").run)
 
 
 def t_scale(inverse_df: float) -> float:

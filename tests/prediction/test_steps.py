@@ -102,8 +102,9 @@ def test_the_papers_steps_are_recognized(name: str) -> None:
     _, voltage = signal(name).sample(100)
     step = step_of(Record(voltage, None, interval=INTERVAL))
     assert step is not None
-    assert float(name.removeprefix("step")) == step.height
-    assert 10.0 == pytest.approx(step.held)
+    height, held = step
+    assert float(name.removeprefix("step")) == height
+    assert 10.0 == pytest.approx(held)
 
 
 @pytest.mark.parametrize(

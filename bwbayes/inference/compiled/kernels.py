@@ -22,9 +22,8 @@ from numba import float64, from_dtype, int64, none, types
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import filter as noise
-from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.filter import SERIES, FilterState, Transition
-from bwbayes.inference.compiled.lanes import LANES, Structs, inner
+from bwbayes.inference.compiled.lanes import LANES, Structs, compile_cached, inner
 from bwbayes.inference.compiled.motion import PIECE, Motion, Shared, displace
 from bwbayes.inference.compiled.stages import Models, Owner, drive_of
 

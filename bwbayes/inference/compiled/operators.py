@@ -23,8 +23,15 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import FloatArray, IntArray, gone
-from bwbayes.inference.compiled.caching import compile_cached
-from bwbayes.inference.compiled.lanes import LANES, Row, Struct, Structs, inner, repeat_last
+from bwbayes.inference.compiled.lanes import (
+    LANES,
+    Row,
+    Struct,
+    Structs,
+    compile_cached,
+    inner,
+    repeat_last,
+)
 from bwbayes.model.compiled import compiled, formula
 from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import monotone_stretches

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled.caching import compile_cached
-from bwbayes.inference.compiled.lanes import LANES, Structs, inner
+from bwbayes.inference.compiled.lanes import LANES, Structs, compile_cached, inner
 from bwbayes.inference.compiled.motion import PIECE, Motion, Shared, displace, physics
 from bwbayes.inference.compiled.stages import (
     CompiledDrive,
