@@ -20,7 +20,7 @@ import bwbayes
 import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.commands.cli import as_typed
-from bwbayes.app.jobs.simulate import simulate
+from bwbayes.app.commands.runs import simulate
 from bwbayes.app.verbs import VERBS
 from bwbayes.errors import InputError, one_line
 from tests.api_reference import every_module

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import map_estimate as pointfit, voltage_noise
+from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.map_estimate import path_covariance, widen_draws
 from bwbayes.inference.study import InitialConditions
-from bwbayes.inference.voltage_noise import path_covariance, widen_draws
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
@@ -154,7 +154,7 @@ def test_one_noisy_record_is_right_and_as_measured_it_is_not(tmp_path: Path) -> 
 
 
 def test_newton_steps_are_what_fits_along_other_paths_move(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(voltage_noise, "COPIES", 4)
+    monkeypatch.setattr(pointfit, "COPIES", 4)
     rng = np.random.default_rng(2)
     posterior = short_posterior(samples=1500, noise="white")
     path = estimate_path(decaying_sine(1500) + 0.3 * rng.standard_normal(1500))

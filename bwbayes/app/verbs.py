@@ -231,7 +231,7 @@ COMMANDS = (
         either={"CONFIG": "a CONFIG"},
         instead={"resumed": "--resume FOLDER"},
     ),
-    Verb("bwbayes.app.jobs.simulate:simulate"),
+    Verb("bwbayes.app.commands.runs:simulate"),
     Verb(
         "bwbayes.app.config.reference:config_reference",
         command="config",

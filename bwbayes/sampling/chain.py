@@ -237,12 +237,12 @@ def draws(
 
     Long chains are thinned by powers of two, to ``MOST_DRAWS`` draws at most. With ``covariances``
     (free, free), of the posterior and a larger one, the draws are widened, see
-    :func:`~bwbayes.inference.voltage_noise.widen_draws`; a draw that the prior would exclude then
+    :func:`~bwbayes.inference.map_estimate.widen_draws`; a draw that the prior would exclude then
     stays as sampled.
     """
     coordinates = chain.coordinates(phase, thinning(chain.draws(phase)))
     if covariances is not None:
-        from bwbayes.inference.voltage_noise import widen_draws  # noqa: PLC0415  # slow to load
+        from bwbayes.inference.map_estimate import widen_draws  # noqa: PLC0415  # slow to load
 
         wide = widen_draws(coordinates, *covariances)
         _, log_prior = posterior.prior.constrain(wide.reshape(-1, wide.shape[-1]))

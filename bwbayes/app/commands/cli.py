@@ -74,19 +74,6 @@ TEXTS = {
     "seed": "Seed, instead of the config's.",
 }
 
-# Options that say how a file is read: of each verb whose function has the argument `reading`.
-READING = Verb(
-    "bwbayes.record.io.formats:read_record",
-    flags={
-        "columns": "column",
-        "units": "unit",
-        "covariates": "covariate",
-        "displacement_file": "displacement",
-        "voltage_is": "",
-        "need_displacement": "",
-    },
-)
-
 
 class WithParts(click.Command):
     """A command whose help lists the parts that a model may have, as the registries do."""
@@ -107,7 +94,10 @@ def command_of(verb: Verb) -> click.Command:
     """Return the command of a verb."""
     words, options, reading = [*_words(verb)], _options(verb), dict[str, click.Option]()
     if options.pop("reading", None):
-        reading = _options(READING)
+        # How a file is read.
+        flags = {"columns": "column", "units": "unit", "covariates": "covariate"}
+        flags |= {"displacement_file": "displacement", "voltage_is": "", "need_displacement": ""}
+        reading = _options(Verb("bwbayes.record.io.formats:read_record", flags=flags))
         if not any("--voltage" in usage for usage in verb.either):
             del reading["displacement_file"]
 

@@ -27,7 +27,7 @@ from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import FigureWorker, one_thread, open_executor
 from bwbayes.errors import InputError
 from bwbayes.inference import Engine, resolve_engine
-from bwbayes.inference.voltage_noise import path_covariance
+from bwbayes.inference.map_estimate import path_covariance
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.result import render, write_bands, write_summary
 from bwbayes.sampling.chain import PHASES, ChainFile
