@@ -437,8 +437,12 @@ def _model_error_sd(
     if rivals is None:
         return None
     rng = study.generator(f"rivals {planned.sha256}")
-    fitted = study.posterior.for_record(of), study.posterior.select_draws(draws, of)
-    return disagreement(*fitted, study.for_record(of), rivals, partial(follow, rng=rng), rng)
+    alone, own_draws = study.posterior.for_record(of), study.posterior.select_draws(draws, of)
+
+    def bands(posterior: Posterior, draws: FloatArray) -> Bands:
+        return follow(posterior, draws, rng)
+
+    return disagreement(alone, own_draws, study.for_record(of), rivals, bands, rng)
 
 
 def reaching(
