@@ -204,19 +204,6 @@ class Span(NamedTuple):
 UNIT = Span(-1.0, 1.0)
 
 
-def narrower(span: Span) -> tuple[Span, ...]:
-    """Return ranges about a span's middle, evenly from next to nothing to all of it.
-
-    Each goes up as far as it goes down, a fifth less and a quarter more.
-    """
-    low, center, half = span.low, span.middle, span.half
-    # Fewer ranges leave steps that show; more take longer.
-    ends = [(k / 16, min(up * k / 16, 1.0)) for k in range(1, 17) for up in (0.8, 1.0, 1.25)]
-    return tuple(
-        dict.fromkeys(Span(max(center - down * half, low), center + up * half) for down, up in ends)
-    )
-
-
 # Part of the range by which the voltage must come back for a turn to count. A sensor's noise and a
 # DAC's steps are well below it; the smallest loops of a decaying drive do not matter for a scale.
 RETURN = 0.05

@@ -155,6 +155,9 @@ class Operator(ABC):
     displacements in um.
     """
 
+    # Whether drives of another range leave states that ``initial`` does not hold.
+    remembers_range: ClassVar = False
+
     @property
     @abstractmethod
     def parameters(self) -> tuple[Declaration, ...]:
@@ -195,13 +198,6 @@ class Operator(ABC):
         On either branch of the loop; by default the lowest and the highest that are reachable.
         """
         return np.stack(self.reachable(column, voltage, span))
-
-    def earlier(self, span: Span) -> tuple[Span, ...]:
-        """Return the ranges of earlier drives within a span that leave states of their own.
-
-        The span alone, if ``initial`` in it holds all states.
-        """
-        return (span,)
 
     @abstractmethod
     def typical_slope(self, column: Values, span: Span) -> FloatArray:

@@ -1,18 +1,21 @@
 """Histories: which drive before a record left the state that it starts from.
 
 Most operators' states are one number, ``initial``. Those that remember extrema have more: how far
-earlier drives went leaves states of its own, and each such range is a history. The lead-in's
-likelihood of a history, and of the states in it, is computed on a grid that closes in on the states
-that it allows. There may be dozens of histories, which most draws rate alike: then a few draws have
-grids, and the others choose among their states, by importance. Stages may remember earlier drives
-as well, and what is in a play makes up for a state: then both are chosen together, by annealing.
+earlier drives went leaves states of its own, and each such range is a history. Ranges are the finer
+the more of them the lead-in rules out. The lead-in's likelihood of a history, and of the states in
+it, is computed on a grid that closes in on the states that it allows. There may be dozens of
+histories, which most draws rate alike: then a few draws have grids, and the others choose among
+their states, by importance. Stages may remember earlier drives as well, and what is in a play makes
+up for a state: then both are chosen together, by annealing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import chain, combinations, pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -30,6 +33,106 @@ FEW = 50
 
 # Starts that each draw tries where they have several unknowns, and how often these move at a step.
 TRIES, MOVES = 16, 5
+
+# Intervals of the ends of earlier drives in half of a span; draws that split ranges, how often an
+# interval is halved at most, and how many ranges each of these draws has split in one go.
+INTERVALS, SPLITTING, SPLITS, SPLIT = 6, 8, 8, 4
+
+# Probability below which a range is left out.
+NEGLIGIBLE = 1e-9
+
+
+class EarlierRange(NamedTuple):
+    """Drives before a record whose lowest and highest voltages lie in two intervals.
+
+    ``span`` are the middles of these, V, and ``sizes`` their lengths, V: zero for one voltage.
+    ``probability`` is that of such drives, beforehand.
+    """
+
+    span: Span
+    sizes: tuple[float, float] = (0.0, 0.0)
+    probability: float = 1.0
+
+    def split(self, ends: Sequence[bool]) -> Iterator[EarlierRange]:
+        """Yield the ranges of both halves of the intervals of some ``ends``, lowest and highest."""
+        below, above = (
+            2 if size and cut else 1 for size, cut in zip(self.sizes, ends, strict=True)
+        )
+        sizes = self.sizes[0] / below, self.sizes[1] / above
+        halves = [
+            [end] if cut == 1 else [end - size / 2, end + size / 2]
+            for end, size, cut in zip(self.span, sizes, (below, above), strict=True)
+        ]
+        for pair in product(*halves):
+            yield EarlierRange(Span(*pair), sizes, self.probability / (below * above))
+
+
+def earlier_ranges(span: Span, voltage: float) -> list[EarlierRange]:
+    """Return ranges of drives within a span before a record that begins at a voltage, V.
+
+    An earlier drive passed that voltage. Up and down it went anywhere within the span in one case
+    of two; in one of four to its end, and in one of four nearly so, into the last interval.
+    """
+
+    def ends(last: float) -> Iterator[tuple[float, float, float]]:
+        count = math.ceil(abs(last - voltage) / span.half * INTERVALS - 1e-6) if span.half else 0
+        yield last, 0.0, 0.25 if count else 1.0
+        for i in range(count):
+            middle = voltage + (last - voltage) * (i + 0.5) / count
+            probability = 0.5 / count + (0.25 if i == count - 1 else 0.0)
+            yield middle, abs(last - voltage) / count, probability
+
+    return [
+        EarlierRange(Span(low, high), (below, above), p * q)
+        for (low, below, p), (high, above, q) in product(ends(span.low), ends(span.high))
+    ]
+
+
+def split_ranges(
+    ranges: Sequence[EarlierRange],
+    history: Callable[[Span], Likelihood],
+    theta: FloatArray,
+    watch: Watch = unwatched,
+) -> list[EarlierRange]:
+    """Split ranges where a lead-in tells sharply how far earlier drives went.
+
+    While a few of the draws θ (draws, parameters) give one end of the drives nearly all of the
+    probability, the most probable ranges have the intervals of that end halved. Improbable ranges
+    are left out in the end. ``history`` returns the likelihood of a range; ``watch`` is called with
+    the share that is done.
+    """
+    few = theta[:: -(-len(theta) // SPLITTING)]
+    evidence = dict[EarlierRange, FloatArray]()
+    for number in watched(range(SPLITS + 1), watch):
+        for earlier in ranges:
+            if earlier not in evidence:
+                likelihood = history(earlier.span)
+                states = States(likelihood, few)
+                log_evidence = _grid(likelihood, states, unwatched)[2]
+                evidence[earlier] = log_evidence + math.log(earlier.probability)
+        # A draw that is not possible after any drive leaves all as probable as any.
+        log = np.maximum([evidence[earlier] for earlier in ranges], -1e300)
+        share = np.exp(log - scipy.special.logsumexp(log, axis=0))
+        lows, highs = zip(*(earlier.span for earlier in ranges), strict=True)
+        sharp = _is_sharp(lows, share), _is_sharp(highs, share)
+        if number == SPLITS or not any(sharp):
+            break
+        best = {*np.argsort(-log, axis=0)[:SPLIT].ravel().tolist()}
+        cut = [
+            earlier.split(sharp) if k in best else (earlier,) for k, earlier in enumerate(ranges)
+        ]
+        ranges = [*chain.from_iterable(cut)]
+    likely = np.max(share, axis=1) > NEGLIGIBLE
+    return [earlier for earlier, keep in zip(ranges, likely.tolist(), strict=True) if keep]
+
+
+def _is_sharp(ends: Sequence[float], share: FloatArray) -> bool:
+    """Tell whether any draw gives nearly all of its ``share`` (ranges, draws) to one of the ends.
+
+    That is, to fewer than two in effect.
+    """
+    of_end = np.equal.outer(np.unique(ends), ends) @ share
+    return bool((np.sum(of_end**2, axis=0) > 0.5).any())
 
 
 @dataclass(frozen=True)
@@ -56,14 +159,17 @@ class Histories:
 
     def with_states(self, theta: FloatArray, quantile: FloatArray) -> FloatArray:
         """Return θ (draws, parameters) with the states of its histories at quantiles (draws,)."""
-        single = len(self.likelihoods) == 1
         (start_theta,) = self.each(
             np.column_stack([theta, quantile]),
-            lambda likelihood, rows: (
-                States(likelihood, rows[:, :-1], single=single).at(rows[:, -1]),
-            ),
+            lambda likelihood, rows: (States(likelihood, rows[:, :-1]).at(rows[:, -1]),),
         )
         return start_theta
+
+
+def pick(probability: FloatArray, quantile: FloatArray) -> IntArray:
+    """Return the history at quantiles (any,) of histories of a ``probability`` (histories,)."""
+    which: IntArray = np.searchsorted(np.cumsum(probability), quantile, side="right")
+    return np.minimum(which, probability.size - 1)
 
 
 def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
@@ -79,14 +185,14 @@ class States:
     even on straight lines between them. In one of many histories they lie between the lowest and
     the highest state that drives of its range leave. The last sweep of an earlier drive ends, as
     often as not, at the record's first voltage: a quarter of the states are the lowest, a quarter
-    the highest. Where one number holds all states, and a history is ``single``, they are what
+    the highest. Where one number holds all states, whatever the range of a drive, they are what
     drives leave that were running when the record began, on the branches of their loops, the lowest
     and the highest as far out as any drive leaves them: half of the drives went over the whole
     range, half over any part of it. A drive over its lower part alone leaves states above those of
     the whole range: on the way up it has had less to make up for.
     """
 
-    def __init__(self, likelihood: Likelihood, theta: FloatArray, *, single: bool) -> None:
+    def __init__(self, likelihood: Likelihood, theta: FloatArray) -> None:
         self.table, self.theta = likelihood.table, theta
         self.quantiles = np.array([0.0, 0.25, 0.75, 1.0])
         if likelihood.from_rest:
@@ -99,7 +205,7 @@ class States:
         voltage = float(np.mean(actuator.pass_inputs(column, inputs[:1], memories)[0]))
         low, high = actuator.hysteresis.reachable(column, voltage, span)
         self.ordered = np.stack([low, low, high, high])
-        if single:
+        if not actuator.hysteresis.remembers_range:
             ends = np.linspace(*span, 9).tolist()
             ranges = [Span(*pair) for pair in combinations(ends, 2)]
             states = [actuator.hysteresis.left(column, voltage, swept) for swept in ranges]
@@ -126,24 +232,30 @@ class States:
 
 def choose_histories(
     likelihoods: tuple[Likelihood, ...],
+    probability: FloatArray,
     theta: FloatArray,
     generator: np.random.Generator,
     watch: Watch = unwatched,
 ) -> tuple[Histories, FloatArray, FloatArray]:
     """Choose every draw's history and state by what the lead-in says; return θ with the states.
 
-    Beforehand all histories are equally probable, and in each all :class:`States`. Beside them
-    comes the log evidence (draws,) of the lead-in for each draw, whatever its history and state.
+    Beforehand histories have a ``probability`` (histories,), and in each all :class:`States` are
+    equally probable. Beside them comes the log evidence (draws,) of the lead-in for each draw,
+    whatever its history and state.
     ``watch`` is called with the share that is done.
     """
     draws, single = len(theta), len(likelihoods) == 1
-    if single and not States(likelihoods[0], theta, single=True).open:
+    if single and not States(likelihoods[0], theta).open:
         which, quantile = np.zeros(draws, dtype=np.int64), np.zeros(draws)
         evidence = np.nan_to_num(likelihoods[0].log_density(theta), nan=-np.inf)
     elif single or draws < 2 * FEW:
-        which, quantile, evidence = _by_grids(likelihoods, theta, generator, watch=watch)
+        which, quantile, evidence = _by_grids(
+            likelihoods, probability, theta, generator, watch=watch
+        )
     else:
-        which, quantile, evidence = _by_importance(likelihoods, theta, generator, watch)
+        which, quantile, evidence = _by_importance(
+            likelihoods, probability, theta, generator, watch
+        )
     watch(1.0)
     histories = Histories(likelihoods, which)
     return histories, histories.with_states(theta, quantile), evidence
@@ -151,6 +263,7 @@ def choose_histories(
 
 def choose_together(
     likelihoods: tuple[Likelihood, ...],
+    probability: FloatArray,
     theta: FloatArray,
     unknowns: Sequence[Put],
     generator: np.random.Generator,
@@ -165,19 +278,19 @@ def choose_together(
     A. Doucet and A. Jasra, J. R. Stat. Soc. B 68 (2006) 411-436; C. J. F. ter Braak, Stat. Comput.
     16 (2006) 239-249.)
     """
-    draws, single = len(theta), len(likelihoods) == 1
+    draws = len(theta)
     theta = np.repeat(theta, TRIES, axis=0)
     every = np.arange(len(theta))
-    states = [States(likelihood, theta, single=single) for likelihood in likelihoods]
+    states = [States(likelihood, theta) for likelihood in likelihoods]
 
     def started(scores: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return histories and θ of normal scores (tries, 2 + unknowns)."""
         # Farther out a probability is one to rounding, and its quantile infinite.
         history, quantile, *others = scipy.special.ndtr(np.clip(scores.T, -8.0, 8.0))
-        which = np.minimum((len(states) * history).astype(np.int64), len(states) - 1)
+        which = pick(probability, history)
         start_theta = np.stack([each.at(quantile) for each in states])[which, every]
-        for put, probability in zip(unknowns, others, strict=True):
-            start_theta = put(start_theta, probability)
+        for put, at in zip(unknowns, others, strict=True):
+            start_theta = put(start_theta, at)
         return which, start_theta
 
     def density(scores: FloatArray) -> FloatArray:
@@ -224,6 +337,7 @@ def choose_together(
 
 def _by_grids(
     likelihoods: tuple[Likelihood, ...],
+    probability: FloatArray,
     theta: FloatArray,
     generator: np.random.Generator,
     repeats: int = 1,
@@ -233,28 +347,28 @@ def _by_grids(
 
     Those of one draw follow one another, (draws * repeats,).
     """
-    single = len(likelihoods) == 1
     grids = [
-        _grid(likelihood, States(likelihood, theta, single=single), of_likelihood)
+        _grid(likelihood, States(likelihood, theta), of_likelihood)
         for likelihood, of_likelihood in parts(likelihoods, watch)
     ]
-    evidence = np.stack([grid[2] for grid in grids])
+    evidence = np.stack([grid[2] for grid in grids]) + np.log(probability)[:, np.newaxis]
     rows = np.repeat(np.arange(len(theta)), repeats)
     best = np.max(evidence, axis=0)
     weight = np.cumsum(np.exp(evidence - best), axis=0)
     which = np.zeros(rows.size, dtype=np.int64)
-    if not single:
+    if len(likelihoods) > 1:
         which = np.sum(weight[:, rows] < uniform(generator, rows.size) * weight[-1, rows], axis=0)
     nodes, density = (np.stack([grid[i] for grid in grids])[which, :, rows].T for i in range(2))
     middles, cells = _cells(nodes, density)
     total = np.cumsum(cells, axis=0)
     cell = np.sum(total < uniform(generator, rows.size) * total[-1], axis=0)
     quantile = middles[cell, np.arange(rows.size)]
-    return which, quantile, best + np.log(weight[-1] / len(grids))
+    return which, quantile, best + np.log(weight[-1])
 
 
 def _by_importance(
     likelihoods: tuple[Likelihood, ...],
+    probability: FloatArray,
     theta: FloatArray,
     generator: np.random.Generator,
     watch: Watch,
@@ -270,7 +384,7 @@ def _by_importance(
     few = np.arange(0, draws, draws // FEW)
     # 500 pairs or more, of which 64 are proposed to each draw.
     pool_which, pool_quantile, evidence = _by_grids(
-        likelihoods, theta[few], generator, -(-500 // few.size), part(watch, 0.0, 0.2)
+        likelihoods, probability, theta[few], generator, -(-500 // few.size), part(watch, 0.0, 0.2)
     )
     pool = np.arange(pool_which.size)
 
@@ -301,14 +415,14 @@ def _by_importance(
     with np.errstate(divide="ignore"):
         evidence = best + np.log(few.size * total[-1] / len(weight))
     index = np.sum(total < uniform(generator, draws) * total[-1], axis=0)
-    pick = proposed[index, np.arange(draws)]
-    which, quantile = pool_which[pick], pool_quantile[pick]
+    picked = proposed[index, np.arange(draws)]
+    which, quantile = pool_which[picked], pool_quantile[picked]
     # With effectively fewer than four proposals, one in ten is beyond the states that a draw
     # allows.
     uncovered = np.flatnonzero(~(total[-1] ** 2 > 4 * np.sum(weight**2, axis=0)))
     if uncovered.size:
         which[uncovered], quantile[uncovered], evidence[uncovered] = _by_grids(
-            likelihoods, theta[uncovered], generator
+            likelihoods, probability, theta[uncovered], generator
         )
     return which, quantile, evidence
 

@@ -19,7 +19,7 @@ wide as ever.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -35,10 +35,14 @@ from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Inputs, Span
 from bwbayes.prediction.bands import LeadIn
 from bwbayes.prediction.histories import (
+    EarlierRange,
     Histories,
     Put,
     choose_histories,
     choose_together,
+    earlier_ranges,
+    pick,
+    split_ranges,
     uniform,
 )
 from bwbayes.record.record import Record
@@ -194,28 +198,32 @@ def estimate_initial_states(
         half_range=span.half,
     )
     theta, unknowns = _of_new_record(posterior, theta, start)
-    earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
-    likelihoods = tuple(
-        replace(likelihood, actuator=replace(actuator, span=swept)) for swept in earlier
-    )
+    ranges = [EarlierRange(span)]
+    if actuator.hysteresis.remembers_range and not start.from_rest:
+        ranges = earlier_ranges(span, float(voltage[0]))
+
+    history = partial(_after, likelihood)
     if window is None:
         for put in unknowns:
             theta = put(theta, generator.uniform(size=len(theta)))
-        return _unseen(likelihoods, theta, generator, settled=start.settled)
+        return _unseen(*_histories(ranges, history), theta, generator, settled=start.settled)
     if estimate_offset:
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = likelihood.table.replaced(theta, "offset", level)
-    elif len(likelihoods) > 1:
+    elif len(ranges) > 1:
         # The mean is in the domain, which is convex; a median of each parameter need not be.
         typical = likelihood.table.actuator(np.mean(theta, axis=0)[np.newaxis])
-        between = _between(likelihoods, typical)
-        likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
-    watch_start = part(watch, 0.0, 0.5)
+        between = _between(ranges, history, typical)
+        history = partial(_after, replace(likelihood, offset_sd=between))
+    if len(ranges) > 1 and not unknowns:
+        ranges = split_ranges(ranges, history, theta, part(watch, 0.0, 0.2))
+    watch_start = part(watch, 0.2, 0.5)
+    known = _histories(ranges, history)
     histories, start_theta, evidence = (
-        choose_together(likelihoods, theta, unknowns, generator, watch_start)
+        choose_together(*known, theta, unknowns, generator, watch_start)
         if unknowns
-        else choose_histories(likelihoods, theta, generator, watch_start)
+        else choose_histories(*known, theta, generator, watch_start)
     )
     rows = resample(evidence, generator)
     theta, start_theta = theta[rows], start_theta[rows]
@@ -260,19 +268,38 @@ def _put_left(
     return alone.table.replaced(theta, parameter.name, value)
 
 
-def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
-    """Return how far, um, a state may lie between those of two histories that come next.
+def _after(likelihood: Likelihood, span: Span) -> Likelihood:
+    """Return the likelihood of a record after drives over a span."""
+    return replace(likelihood, actuator=replace(likelihood.actuator, span=span))
+
+
+def _histories(
+    ranges: Sequence[EarlierRange], history: Callable[[Span], Likelihood]
+) -> tuple[tuple[Likelihood, ...], FloatArray]:
+    """Return the likelihoods of ranges, and their probabilities beforehand (ranges,)."""
+    probability = np.array([earlier.probability for earlier in ranges])
+    likelihoods = tuple(history(earlier.span) for earlier in ranges)
+    return likelihoods, probability / np.sum(probability)
+
+
+def _between(
+    ranges: Sequence[EarlierRange], history: Callable[[Span], Likelihood], model: FloatArray
+) -> float:
+    """Return how far, um, a state may lie between those of two ranges that come next.
 
     States that a drive does not reach stay as they were left, as a part of the offset. It is half
-    of the root-mean-square difference between histories that come next, of a ``model`` (1,
-    parameters).
+    of the root-mean-square difference between ranges that have one end in common and come next at
+    the other, of a ``model`` (1, parameters).
     """
-    first = likelihoods[0]
-    paths = [
-        history.simulate(model, first.inputs_read)[0, first.readings.rows]
-        for history in likelihoods
-    ]
-    return float(np.sqrt(np.mean(np.diff(np.mean(paths, axis=1)) ** 2)) / 2)
+    level = {}
+    for earlier in ranges:
+        likelihood = history(earlier.span)
+        path = likelihood.simulate(model, likelihood.inputs_read)[0, likelihood.readings.rows]
+        level[earlier.span] = float(np.mean(path))
+    spans = sorted(level)
+    levels = np.reshape([level[span] for span in spans], (len({s.low for s in spans}), -1))
+    steps = [np.diff(levels, axis=axis).ravel() for axis in (0, 1)]
+    return float(np.sqrt(np.mean(np.concatenate(steps) ** 2)) / 2)
 
 
 def continue_discrepancy(
@@ -315,16 +342,17 @@ def training_initial_states(
 
 def _unseen(
     likelihoods: tuple[Likelihood, ...],
+    probability: FloatArray,
     theta: FloatArray,
     generator: np.random.Generator,
     *,
     settled: bool,
 ) -> InitialStates:
-    """Draw the start from what is known of it beforehand: all histories are equally probable."""
+    """Draw the start from what is known of it beforehand."""
     draws, first = len(theta), likelihoods[0]
     which = np.zeros(draws, dtype=np.int64)
     if len(likelihoods) > 1:
-        which = (len(likelihoods) * uniform(generator, draws)).astype(np.int64)
+        which = pick(probability, uniform(generator, draws))
     histories = Histories(likelihoods, which)
     (sd,) = histories.each(theta, lambda likelihood, rows: (likelihood.start_sd(rows),))
     if settled:

@@ -115,6 +115,7 @@ def test_bands_cover_records_behind_a_play_that_begins_anywhere() -> None:
 
 def unasked(
     likelihoods: tuple[Likelihood, ...],
+    probability: FloatArray,
     theta: FloatArray,
     unknowns: Iterable[Put],
     generator: np.random.Generator,
@@ -123,12 +124,12 @@ def unasked(
     """Choose histories, and take the unknowns of stages as they are drawn beforehand."""
     for put in unknowns:
         theta = put(theta, generator.uniform(size=len(theta)))
-    return choose_histories(likelihoods, theta, generator)
+    return choose_histories(likelihoods, probability, theta, generator)
 
 
 @pytest.mark.slow
 def test_twin_earlier_drives_taken_for_as_large_as_the_range_do_not_cover_them() -> None:
-    with patch.object(RemembersExtrema, "earlier", Operator.earlier):
+    with patch.object(RemembersExtrema, "remembers_range", Operator.remembers_range):
         every = studied(Case(hysteresis="preisach"), QUICK, seed=1)
     assert np.mean(covered(every, 95)) < LEAST
 

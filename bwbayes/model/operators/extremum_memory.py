@@ -13,13 +13,13 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Distribution, Values, refuse
-from bwbayes.model.inputs import PIECE, Span, monotone_stretches, narrower
+from bwbayes.model.inputs import PIECE, Span, monotone_stretches
 from bwbayes.model.operator import Operator
 
 INITIAL = Declaration(
@@ -80,12 +80,14 @@ class RemembersExtrema(Operator):
     ascending branch and 1 the descending one, and w at u₀ rises with ``initial`` from one to the
     other.
 
-    A drive that was smaller leaves other states, which show once the voltage goes beyond what it
-    reached: :meth:`earlier`. A prediction's unknown initial states include these.
+    A drive over another range leaves other states, which show once the voltage goes beyond what it
+    reached. A prediction's unknown initial states include these.
 
     Sources: F. Preisach, Z. Phys. 94 (1935) 277-302; I. D. Mayergoyz, Mathematical Models of
     Hysteresis (Springer, 1991), for the stack and the Everett function.
     """
+
+    remembers_range: ClassVar = True
 
     @abstractmethod
     def numbers(self, column: Values) -> FloatArray:
@@ -181,10 +183,6 @@ class RemembersExtrema(Operator):
         inside = float(span.low < voltage < span.high)
         bound = np.full(column[INITIAL.name].size, inside)
         return -bound, bound
-
-    def earlier(self, span: Span) -> tuple[Span, ...]:
-        """Return ranges about the span's middle, evenly from next to nothing to all of it."""
-        return narrower(span)
 
     def typical_slope(self, column: Values, span: Span) -> FloatArray:
         """Return the mean slope from the span's lowest to its highest voltage (models,), um/V."""
