@@ -120,8 +120,7 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
             continue
         for spec in _histories(scene, scene.study.spec.with_stages(name)):
             kind, text = f"operator {name}", f"another operator, {name}"
-            is_other = spec.history != scene.study.spec.history
-            if is_other:
+            if spec.history != scene.study.spec.history:
                 kind, text = f"{kind}, demagnetized", f"{text}, {DEMAGNETIZED}"
             if not scene.looks_for(kind):
                 continue
@@ -129,14 +128,12 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
             # One start finds the best mode of nearly all records, in half of the time of five.
             places = scene.local_minima(posterior, 1)
             fit = scene.extended(posterior, places)
-            # Another history is only named: a next record's own is told by its lead-in alone, which
-            # a spectrum of plays that is nearly right is too sure of.
             yield scene.explained(
                 kind,
                 text,
                 lines(scene.study.spec, spec),
                 fit,
-                spec=None if is_other else spec,
+                spec=spec,
                 coordinates=fit.coordinates,
             )
 
