@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from bwbayes.app.commands import cli
 from bwbayes.record import Record, write_record
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Decay, Sine, Staircase, Waveform
+from bwbayes.record.waveforms import Waveform, sine, staircase
 from bwbayes.report.figures import picture_of
 from bwbayes.report.result import NO_PLOTS
 from tests.app import small
@@ -118,9 +118,9 @@ def _measured(name: str) -> Record:
     """Return a reader's record of that name: 37 s at 25 readings a second, or a short step."""
     stand = VirtualTestStand(discrepancy="none", sample_rate=25.0)
     if name.startswith("step"):
-        drive = Waveform(Staircase((10.0,), 5.0), 6.0, start=1.0)
+        drive = Waveform(staircase((10.0,), 5.0), 6.0, start=1.0)
     else:
-        drive = Waveform(Sine(100.0, 0.8), 37.0, decay=Decay(0.0, 0.025))
+        drive = Waveform(sine(100.0, 0.8), 37.0, decay=0.025)
     generator = np.random.default_rng(list(name.encode()))
     return replace(stand.run(drive, generator), truth=None)
 

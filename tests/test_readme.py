@@ -21,7 +21,7 @@ from bwbayes.model.declaration import Context, Distribution, Ranges
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.prediction import prediction
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Decay, Sine, Waveform
+from bwbayes.record.waveforms import Waveform, sine
 from bwbayes.sampling import diagnostics
 from tests.app import small
 from tests.examples import README, ROOT, blocks
@@ -57,11 +57,11 @@ def test_the_lines_of_python_go_from_arrays_to_bands(monkeypatch: pytest.MonkeyP
     small.without_explanations(monkeypatch)
     stand = VirtualTestStand(discrepancy="none", sample_rate=500.0)
     generator = np.random.default_rng(1)
-    record = stand.run(Waveform(Sine(100.0, 1.0), 7.0, decay=Decay(0.0, 0.1)), generator)
+    record = stand.run(Waveform(sine(100.0, 1.0), 7.0, decay=0.1), generator)
     names: dict[str, Any] = {
         "voltage": record.voltage,
         "displacement": record.displacement,
-        "new_record": stand.run(Waveform(Sine(80.0, 0.7), 4.0), generator),
+        "new_record": stand.run(Waveform(sine(80.0, 0.7), 4.0), generator),
     }
     (lines,) = blocks("python")
     # That is what a reader does, with a quarter of the samples, fewer draws and walkers.

@@ -18,17 +18,17 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.record import Record, write_record
 from bwbayes.record.teststand import RingBender, VirtualTestStand
-from bwbayes.record.waveforms import Decay, Sine, Staircase, Waveform
+from bwbayes.record.waveforms import Waveform, sine, staircase
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
 from tests.sampled import sampled
 from tests.stand import Stand
 
 DRIVES = {
-    "decaying sine": Waveform(Sine(100.0, 1.0), 10.0, decay=Decay(0.0, 0.1)),
-    "decaying sine, 20 V": Waveform(Sine(20.0, 1.0), 10.0, decay=Decay(0.0, 0.1)),
-    "constant sine": Waveform(Sine(100.0, 1.0), 10.0),
-    "staircase": Waveform(Staircase((25.0, 50.0, 75.0, 100.0, 75.0, 50.0, 25.0), 1.4), 10.0),
+    "decaying sine": Waveform(sine(100.0, 1.0), 10.0, decay=0.1),
+    "decaying sine, 20 V": Waveform(sine(20.0, 1.0), 10.0, decay=0.1),
+    "constant sine": Waveform(sine(100.0, 1.0), 10.0),
+    "staircase": Waveform(staircase((25.0, 50.0, 75.0, 100.0, 75.0, 50.0, 25.0), 1.4), 10.0),
 }
 RATES = (10.0, 1000.0)
 

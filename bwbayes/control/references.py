@@ -18,7 +18,7 @@ import scipy
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.record.waveforms import Triangle
+from bwbayes.record.waveforms import triangle
 from bwbayes.shown import brief
 
 # Fewer samples make no reference, and more than a file or a screen could hold no shape.
@@ -193,7 +193,12 @@ def tracking_signals(
     sine = np.sin(2 * np.pi * turns)
     end = turns[-1] + (turns[-1] - turns[-2])
     steps = np.where((turns + 1e-9) % 1.0 < 0.5, 1.0, -1.0)
-    shapes = (sine, sine * (1 - turns / end), steps, np.round(5 * Triangle(1.0, 1.0)(turns)) / 5)
+    shapes = (
+        sine,
+        sine * (1 - turns / end),
+        steps,
+        np.round(5 * triangle(1.0, 1.0).voltage(turns)) / 5,
+    )
     kernel = np.hanning(rise + 2)[1:-1]
     smoothed = [
         np.convolve(shape, kernel / kernel.sum())[: turns.size] if jumps else shape

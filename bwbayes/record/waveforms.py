@@ -1,8 +1,8 @@
 """The voltages that drive an actuator: the paper's signals, and parts to build others from.
 
-A :class:`Waveform` is a carrier (:class:`Sine`, :class:`Triangle`, :class:`Staircase`,
-:class:`Multisine`) times an amplitude :class:`Decay`, switched on at a start time and sampled at a
-rate; a step is a staircase of one level. The paper's own signals are made of these, and
+A :class:`Waveform` is a carrier (:func:`sine`, :func:`triangle`, :func:`staircase`, or any function
+of the time) whose amplitude may decay, switched on at a start time and sampled at a rate; a step is
+a staircase of one level. The paper's own signals are made of these, and
 :func:`signal` finds them by name. A value that is not finite, or not what its description says, is
 an :class:`InputError`.
 """
@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -30,174 +30,79 @@ def _require(where: str, value: float, kind: Literal["finite", "positive", "not 
         raise InputError(f"{where}: {value} is not {kind}; give a {kind} number")
 
 
-class Carrier(Protocol):
-    """A voltage as a function of the time since its start."""
-
-    @property
-    def highest_frequency(self) -> float:
-        """Highest frequency that a sampling has to resolve, Hz."""
-
-    def __call__(self, elapsed: FloatArray) -> FloatArray:
-        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+def _require_wave(where: str, amplitude: float, frequency: float, phase: float) -> None:
+    _require(f"{where}: amplitude", amplitude, "finite")
+    _require(f"{where}: frequency", frequency, "positive")
+    _require(f"{where}: phase", phase, "finite")
 
 
 @dataclass(frozen=True)
-class Sine:
-    """``v = amplitude sin(2 pi frequency t + phase)``: equation (1) of the paper.
+class Carrier:
+    """A voltage as a function of the time since its start.
 
-    Parameters
-    ----------
-    amplitude : float
-        V.
-    frequency : float
-        Hz, above zero.
-    phase : float
-        Phase at the start, rad; with pi the voltage goes down first.
+    ``voltage`` (samples,), V, at times (samples,), s; sampling has to resolve the
+    ``highest_frequency``, Hz.
     """
 
-    amplitude: float
-    frequency: float
-    phase: float = 0.0
-
-    def __post_init__(self) -> None:
-        where = type(self).__name__.lower()
-        _require(f"{where}: amplitude", self.amplitude, "finite")
-        _require(f"{where}: frequency", self.frequency, "positive")
-        _require(f"{where}: phase", self.phase, "finite")
-
-    @property
-    def highest_frequency(self) -> float:
-        """The fundamental frequency, Hz."""
-        return self.frequency
-
-    def __call__(self, elapsed: FloatArray) -> FloatArray:
-        """Voltage (samples,) in V at the times (samples,) in s since the start."""
-        return self.amplitude * np.sin(2 * np.pi * self.frequency * elapsed + self.phase)
+    voltage: Callable[[FloatArray], FloatArray]
+    highest_frequency: float
 
 
-class Triangle(Sine):
-    """A triangle with the zeros and peaks of the :class:`Sine` of the same parameters.
+def sine(amplitude: float, frequency: float, phase: float = 0.0) -> Carrier:
+    """Return ``v = amplitude sin(2 pi frequency t + phase)``: equation (1) of the paper.
+
+    The amplitude is in V, the frequency in Hz, above zero, the phase in rad; with pi the voltage
+    goes down first.
+    """
+    _require_wave("sine", amplitude, frequency, phase)
+    return Carrier(lambda t: amplitude * np.sin(2 * np.pi * frequency * t + phase), frequency)
+
+
+def triangle(amplitude: float, frequency: float, phase: float = 0.0) -> Carrier:
+    """Return a triangle with the zeros and peaks of the :func:`sine` of the same parameters.
 
     Its slope is ``+-4 amplitude frequency`` (V/s); the harmonics of its corners alias.
     """
+    _require_wave("triangle", amplitude, frequency, phase)
 
-    def __call__(self, elapsed: FloatArray) -> FloatArray:
-        """Voltage (samples,) in V at the times (samples,) in s since the start."""
-        cycles = self.frequency * elapsed + self.phase / (2 * np.pi)
-        return self.amplitude * (4 * np.abs((cycles + 0.75) % 1.0 - 0.5) - 1)
+    def voltage(t: FloatArray) -> FloatArray:
+        cycles = frequency * t + phase / (2 * np.pi)
+        return amplitude * (4 * np.abs((cycles + 0.75) % 1.0 - 0.5) - 1)
+
+    return Carrier(voltage, frequency)
 
 
-@dataclass(frozen=True)
-class Staircase:
-    """Levels held one after the other; the last one stays.
+def staircase(levels: Sequence[float], dwell: float, rate: float = math.inf) -> Carrier:
+    """Return levels, V, that are held one after the other; the last one stays.
 
-    Parameters
-    ----------
-    levels : tuple of float
-        Levels in V, in their order; at least one.
-    dwell : float
-        Time from one level to the next, s, above zero.
-    rate : float
-        How fast the voltage goes to the next level, V/s; a jump by default.
+    The time from one level to the next is the dwell, s, above zero; ``rate`` is how fast the
+    voltage goes to the next level, V/s, by default at once.
     """
+    if not levels:
+        raise InputError("staircase: levels: there is none; give at least one voltage")
+    for level in levels:
+        _require("staircase: levels", level, "finite")
+    _require("staircase: dwell", dwell, "positive")
+    volts = np.asarray(levels, dtype=np.float64)
 
-    levels: tuple[float, ...]
-    dwell: float
-    rate: float = math.inf
-
-    def __post_init__(self) -> None:
-        if not self.levels:
-            raise InputError("staircase: levels: there is none; give at least one voltage")
-        for level in self.levels:
-            _require("staircase: levels", level, "finite")
-        _require("staircase: dwell", self.dwell, "positive")
-
-    @property
-    def highest_frequency(self) -> float:
-        """Frequency of a square wave of the same dwell, Hz; 0 for a single level."""
-        return 0.5 / self.dwell if len(self.levels) > 1 else 0.0
-
-    def __call__(self, elapsed: FloatArray) -> FloatArray:
-        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+    def voltage(t: FloatArray) -> FloatArray:
         # A sample at the very end of a level belongs to the next one, whatever the rounding.
-        passed = np.floor(elapsed / self.dwell + 1e-9)
-        index = np.minimum(passed, len(self.levels) - 1).astype(np.int64)
-        levels = np.asarray(self.levels, dtype=np.float64)
-        if math.isinf(self.rate):
-            return levels[index]
-        before = levels[np.maximum(index - 1, 0)]
-        moved = self.rate * (elapsed - self.dwell * index)
-        return before + np.clip(levels[index] - before, -moved, moved)
+        index = np.minimum(np.floor(t / dwell + 1e-9), volts.size - 1).astype(np.int64)
+        if math.isinf(rate):
+            return volts[index]
+        before, moved = volts[np.maximum(index - 1, 0)], rate * (t - dwell * index)
+        return before + np.clip(volts[index] - before, -moved, moved)
 
-
-@dataclass(frozen=True)
-class Multisine:
-    """The mean of sines of one amplitude: reversals at many voltages.
-
-    Parameters
-    ----------
-    amplitude : float
-        V.
-    frequencies : tuple of float
-        Hz, above zero, one or more.
-    """
-
-    amplitude: float
-    frequencies: tuple[float, ...]
-
-    @property
-    def highest_frequency(self) -> float:
-        """The highest of the frequencies, Hz."""
-        return max(self.frequencies)
-
-    def __call__(self, elapsed: FloatArray) -> FloatArray:
-        """Voltage (samples,) in V at the times (samples,) in s since the start."""
-        phases = 2 * np.pi * np.multiply.outer(self.frequencies, elapsed)
-        mean: FloatArray = self.amplitude * np.mean(np.sin(phases), axis=0)
-        return mean
-
-
-@dataclass(frozen=True)
-class Decay:
-    """The factor that lets an amplitude die out; with rate 0, the default, it stays.
-
-    With ``e = max(0, t - start)`` the factor is ``max(0, 1 - rate e)`` (linear, equations (3) and
-    (4) of the paper) or ``exp(-rate e)`` (exponential).
-
-    Parameters
-    ----------
-    start : float
-        Time from which the amplitude decays, counted from the first sample, s.
-    rate : float
-        Decay rate, 1/s, not below zero.
-    kind : {"linear", "exponential"}
-        The law of the decay.
-    """
-
-    start: float = 0.0
-    rate: float = 0.0
-    kind: Literal["linear", "exponential"] = "linear"
-
-    def __post_init__(self) -> None:
-        _require("decay: start", self.start, "finite")
-        _require("decay: rate", self.rate, "not negative")
-        if self.kind not in ("linear", "exponential"):
-            raise InputError(f"decay: kind: no {self.kind!r}; give 'linear' or 'exponential'")
-
-    def __call__(self, time: FloatArray) -> FloatArray:
-        """Return the factor (samples,) at the times (samples,) in s since the first sample."""
-        elapsed = np.maximum(time - self.start, 0.0)
-        if self.kind == "exponential":
-            return np.exp(-self.rate * elapsed)
-        return np.maximum(1.0 - self.rate * elapsed, 0.0)
+    return Carrier(voltage, 0.5 / dwell if volts.size > 1 else 0.0)
 
 
 @dataclass(frozen=True)
 class Waveform:
     """A voltage that rests at its bias until a start time and then follows its carrier.
 
-    ``V(t) = bias`` before the start and ``V(t) = bias + carrier(t - start) decay(t)`` from then
-    on: equations (1) and (3) of the paper, whose bias is zero.
+    ``V(t) = bias`` before the start and ``V(t) = bias + carrier(t - start) q(t)`` from then on:
+    equations (1) and (3) of the paper, whose bias is zero. The amplitude decays to zero,
+    ``q = max(0, 1 - decay max(0, t - decay_from))``: equations (3) and (4).
 
     Parameters
     ----------
@@ -207,8 +112,10 @@ class Waveform:
         Length of the signal, s, above zero.
     start : float
         Time at which the carrier starts, s, not below zero and within the duration.
-    decay : Decay
-        Factor on the carrier; it counts time from the first sample, as the paper's q(t) does.
+    decay : float
+        Decay rate, 1/s, not below zero.
+    decay_from : float
+        Time from which the amplitude decays, counted from the first sample, s.
     bias : float
         V; it does not decay.
     """
@@ -216,12 +123,15 @@ class Waveform:
     carrier: Carrier
     duration: float
     start: float = 0.0
-    decay: Decay = Decay()
+    decay: float = 0.0
+    decay_from: float = 0.0
     bias: float = 0.0
 
     def __post_init__(self) -> None:
         _require("waveform: duration", self.duration, "positive")
         _require("waveform: start", self.start, "not negative")
+        _require("waveform: decay", self.decay, "not negative")
+        _require("waveform: decay_from", self.decay_from, "finite")
         _require("waveform: bias", self.bias, "finite")
         if self.start >= self.duration:
             raise InputError(
@@ -232,7 +142,8 @@ class Waveform:
     def __call__(self, time: ArrayLike) -> FloatArray:
         """Voltage (samples,) in V at the times (samples,) in s since the first sample."""
         times = np.asarray(time, dtype=np.float64)
-        driven = self.carrier(np.maximum(times - self.start, 0.0)) * self.decay(times)
+        left = np.maximum(1.0 - self.decay * np.maximum(times - self.decay_from, 0.0), 0.0)
+        driven = self.carrier.voltage(np.maximum(times - self.start, 0.0)) * left
         return self.bias + np.where(times >= self.start, driven, 0.0)
 
     def sample(self, rate: float) -> tuple[FloatArray, FloatArray]:
@@ -270,13 +181,13 @@ class Waveform:
 SIGNALS: Mapping[str, Waveform] = MappingProxyType(
     {
         "identification": Waveform(
-            Sine(100.0, 1.0, phase=math.pi), 16.0, start=0.5, decay=Decay(4.0, 0.1)
+            sine(100.0, 1.0, phase=math.pi), 16.0, start=0.5, decay=0.1, decay_from=4.0
         ),
         "verification": Waveform(
-            Sine(100.0, 0.1, phase=math.pi), 50.0, start=5.0, decay=Decay(25.0, 0.05)
+            sine(100.0, 0.1, phase=math.pi), 50.0, start=5.0, decay=0.05, decay_from=25.0
         ),
         **{
-            f"step{height}": Waveform(Staircase((float(height),), dwell=10.0), 11.0, start=1.0)
+            f"step{height}": Waveform(staircase((float(height),), dwell=10.0), 11.0, start=1.0)
             for height in (10, 50, 100)
         },
     }

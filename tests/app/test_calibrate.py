@@ -24,7 +24,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Decay, Sine, Waveform
+from bwbayes.record.waveforms import Waveform, sine
 from bwbayes.sampling.plan import SamplingPlan
 from tests.app import small
 from tests.app.conftest import Type
@@ -322,7 +322,7 @@ def test_intervals_of_a_run_are_right_for_its_record() -> None:
     Parameters share their record, and so most of what luck does in it.
     """
     stand = VirtualTestStand(sample_rate=50.0)
-    record = stand.run(Waveform(Sine(100.0, 1.0), 6.0, decay=Decay(0.0, 0.1)), default_rng(1))
+    record = stand.run(Waveform(sine(100.0, 1.0), 6.0, decay=0.1), default_rng(1))
     fit = bw.fit(record, dynamics="lag", search="none", progress=False, seed=1)
     found = fit.calibrate(replicates=200, progress=False)
     cover = {name: statistic.covered[95] for name, statistic in found.statistics.items()}

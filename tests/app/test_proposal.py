@@ -31,7 +31,7 @@ from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_named, read_source
 from bwbayes.record.io.series import Source
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Decay, Sine, Waveform
+from bwbayes.record.waveforms import Waveform, sine
 from tests.app import small
 from tests.app.conftest import Type
 
@@ -43,7 +43,7 @@ OWN = "time_s,voltage_V,displacement_um"
 @pytest.fixture(scope="module")
 def record() -> Record:
     """Return a decaying sine of six seconds at 100 Hz."""
-    waveform = Waveform(Sine(100.0, 1.0), 6.0, 0.0, Decay(1.0, 0.1))
+    waveform = Waveform(sine(100.0, 1.0), 6.0, decay=0.1, decay_from=1.0)
     return VirtualTestStand("process", 100.0).run(waveform, np.random.default_rng(1))
 
 

@@ -20,7 +20,7 @@ from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.declaration import Distribution
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Sine, Waveform, signal
+from bwbayes.record.waveforms import Waveform, signal, sine
 from tests.inference.linear import Linear
 from tests.inference.problems import (
     TRUE_NOISE,
@@ -49,8 +49,8 @@ def at_truth(posterior: Posterior) -> MAPEstimate:
     return MAPEstimate(mode, unit, 0.0, mode[np.newaxis], unit)
 
 
-def sine(amplitude: float, frequency: float, periods: float = 10.0) -> Waveform:
-    return Waveform(Sine(amplitude, frequency), periods / frequency)
+def sines(amplitude: float, frequency: float, periods: float = 10.0) -> Waveform:
+    return Waveform(sine(amplitude, frequency), periods / frequency)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def sine(amplitude: float, frequency: float, periods: float = 10.0) -> Waveform:
 def test_one_sine_leaves_a_combination_with_gamma_open(
     amplitude: float, frequency: float, discrepancy: Discrepancy
 ) -> None:
-    posterior = measured(sine(amplitude, frequency), discrepancy)
+    posterior = measured(sines(amplitude, frequency), discrepancy)
     (finding,) = undetermined(posterior, at_truth(posterior))
     assert finding.text.startswith("gamma")
     assert "% of the effective prior's SD remains if the model is off by 1%" in finding.text
@@ -71,7 +71,7 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
 def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
     """What it shows is d - alpha and alpha beta: both may grow while beta falls."""
     fixed = {"gamma": 0.0, "initial": 0.0, "mass": 0.00134, "stiffness": 4.1e5}
-    record = measured(sine(10.0, 1.0, 3.0), rate=250.0).single_record
+    record = measured(sines(10.0, 1.0, 3.0), rate=250.0).single_record
     small = posterior_of(record.voltage, record.displacement, record.actuator, "discrepancy", fixed)
     (finding,) = undetermined(small, at_truth(small))
     assert finding.text.startswith("alpha with d against beta: ")

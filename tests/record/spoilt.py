@@ -13,7 +13,7 @@ from bwbayes.errors import InputWarning
 from bwbayes.model.inputs import turning_points
 from bwbayes.record import Record
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
+from bwbayes.record.waveforms import Waveform, signal, sine, staircase, triangle
 
 Generator = np.random.Generator
 Discrepancy = Literal["none", "process", "structural"]
@@ -45,12 +45,13 @@ def _run(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         record = stand.run(required, generator)
-    if isinstance(required, Waveform) and required.decay.start == FROM_MOTION.start:
+    if isinstance(required, Waveform) and required.decay_from == FROM_MOTION:
         return record.window(float(generator.uniform(1, 3)), record.duration)
     return record
 
 
-FROM_MOTION = Decay(3.5, 0.06)
+# When a drive begins to decay whose record begins in motion, s.
+FROM_MOTION = 3.5
 
 
 def _random(amplitude: float, rate: float, generator: Generator) -> FloatArray:
@@ -74,29 +75,33 @@ def _multisine(amplitude: float, rate: float, generator: Generator) -> FloatArra
 
 LOOPING: Mapping[str, Callable[[float, float, Generator], Waveform | FloatArray]] = {
     "decaying sine": lambda amplitude, _, g: Waveform(
-        Sine(amplitude, float(g.choice([0.5, 1.0, 2.0, 5.0])), g.uniform(0, 2 * np.pi)),
+        sine(amplitude, float(g.choice([0.5, 1.0, 2.0, 5.0])), g.uniform(0, 2 * np.pi)),
         float(g.uniform(6, 16)),
-        decay=Decay(1.0, float(g.uniform(0.03, 0.15))),
+        decay=float(g.uniform(0.03, 0.15)),
+        decay_from=1.0,
     ),
     "identification": lambda *_: signal("identification"),
     "verification": lambda *_: signal("verification"),
     "random": _random,
     "triangle": lambda amplitude, _, g: Waveform(
-        Triangle(amplitude, float(g.choice([0.5, 1.0, 3.0]))), 8.0, decay=Decay(2.0, 0.1)
+        triangle(amplitude, float(g.choice([0.5, 1.0, 3.0]))), 8.0, decay=0.1, decay_from=2.0
     ),
     "multisine": _multisine,
     "from motion": lambda amplitude, _, g: Waveform(
-        Sine(amplitude, float(g.choice([1.0, 2.0])), g.uniform(0, 2 * np.pi)),
+        sine(amplitude, float(g.choice([1.0, 2.0])), g.uniform(0, 2 * np.pi)),
         14.0,
-        decay=FROM_MOTION,
+        decay=0.06,
+        decay_from=FROM_MOTION,
     ),
 }
 OTHERS: Mapping[str, Callable[[float, float, Generator], Waveform | FloatArray]] = {
     "steps": lambda amplitude, _, g: Waveform(
-        Staircase(tuple(g.uniform(-amplitude, amplitude, 12).tolist()), float(g.uniform(0.3, 2))),
+        staircase(tuple(g.uniform(-amplitude, amplitude, 12).tolist()), float(g.uniform(0.3, 2))),
         float(g.uniform(5, 15)),
     ),
-    "slow": lambda amplitude, *_: Waveform(Sine(amplitude, 0.05), 60.0, decay=Decay(20.0, 0.02)),
+    "slow": lambda amplitude, *_: Waveform(
+        sine(amplitude, 0.05), 60.0, decay=0.02, decay_from=20.0
+    ),
     "step": lambda _a, _r, g: signal(f"step{float(g.choice([10.0, 50.0, 100.0])):.0f}"),
 }
 
@@ -177,7 +182,7 @@ def _coarse(_: Record, g: Generator) -> Record:
 
 
 def _one_amplitude(_: Record, g: Generator) -> Record:
-    shape = (Sine, Triangle)[int(g.integers(2))]
+    shape = (sine, triangle)[int(g.integers(2))]
     drive = shape(float(g.uniform(20, 45)), float(g.uniform(0.5, 2)), float(g.uniform(0, 6)))
     wave = Waveform(drive, float(g.uniform(4, 9)), bias=float(g.choice([0, 50])))
     return VirtualTestStand("process", 250.0).run(wave, g)

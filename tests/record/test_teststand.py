@@ -20,7 +20,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.model.registry import HYSTERESIS, build_part
 from bwbayes.record.teststand import Amplifier, LaserSensor, VirtualTestStand, creep
-from bwbayes.record.waveforms import Decay, Sine, Triangle, Waveform, signal
+from bwbayes.record.waveforms import Waveform, signal, sine, triangle
 
 MILLISECOND = 1e-3
 
@@ -66,7 +66,7 @@ def scalar_displacement(command: FloatArray) -> list[float]:
     [
         signal("identification"),
         signal("step100"),
-        Waveform(Triangle(95.0, 3.0), duration=3.0, decay=Decay(0.5, 0.7, "exponential")),
+        Waveform(triangle(95.0, 3.0), duration=3.0, decay=0.3, decay_from=0.5),
     ],
     ids=["identification", "step100", "triangle"],
 )
@@ -77,7 +77,7 @@ def test_without_discrepancy_the_truth_is_a_slow_scalar_integration(drive: Wavef
 
 
 def test_a_command_beyond_100_volts_is_limited_and_said_so() -> None:
-    drive = Waveform(Sine(130.0, 1.0), duration=1.0)
+    drive = Waveform(sine(130.0, 1.0), duration=1.0)
     with pytest.warns(InputWarning, match="reaches 130 V, the amplifier limits it to 100 V"):
         record = VirtualTestStand("none").run(drive, generator())
     output = Amplifier().output(record.voltage, MILLISECOND)
@@ -141,7 +141,7 @@ def test_bad_input_is_named_in_one_line() -> None:
         with pytest.raises(InputError, match=r"^test stand: voltage of shape"):
             stand.run(voltage, generator())
     with pytest.raises(InputError, match="cannot resolve 600 Hz"):
-        stand.run(Waveform(Sine(1.0, 600.0), 1.0), generator())
+        stand.run(Waveform(sine(1.0, 600.0), 1.0), generator())
 
 
 # Any actuator on the stand: its truth is what the fitted model computes, to rounding

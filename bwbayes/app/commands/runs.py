@@ -323,17 +323,17 @@ def simulate(
     from bwbayes.inference.study import generator
     from bwbayes.record import write_record
     from bwbayes.record.teststand import VirtualTestStand
-    from bwbayes.record.waveforms import Sine, Waveform, signal as named
+    from bwbayes.record.waveforms import Waveform, signal as named, sine
     from bwbayes.report.result import refuse_existing, write_summary
 
     parameters = out.with_name(f"{out.stem}.truth.json")
     truth_file = out.with_name(f"{out.stem}.truth{out.suffix}")
     refuse_existing([out, truth_file, parameters], overwrite=overwrite)
-    sine = {"amplitude": amplitude, "frequency": frequency, "duration": duration}
-    arguments = {name: value for name, value in sine.items() if value is not None}
+    stated = {"amplitude": amplitude, "frequency": frequency, "duration": duration}
+    arguments = {name: value for name, value in stated.items() if value is not None}
     if signal == "sine":
         options = {"amplitude": 100.0, "frequency": 1.0, "duration": 16.0} | arguments
-        waveform = Waveform(Sine(options["amplitude"], options["frequency"]), options["duration"])
+        waveform = Waveform(sine(options["amplitude"], options["frequency"]), options["duration"])
     elif arguments:
         raise InputError(f"simulate: {', '.join(arguments)} need --signal sine")
     else:

@@ -8,7 +8,6 @@ band's width along a drive, or of what rivals of the model differ by.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,14 +29,12 @@ from bwbayes.record import Record
 from bwbayes.record.io.formats import read_named
 from bwbayes.record.waveforms import (
     Carrier,
-    Decay,
-    Multisine,
-    Sine,
-    Staircase,
-    Triangle,
     Waveform,
     signal,
     signal_names,
+    sine,
+    staircase,
+    triangle,
 )
 from bwbayes.watching import WatchSteps, unwatched
 
@@ -196,29 +193,32 @@ def _preset(record: Record, amplifier: Limits, seconds: float) -> dict[str, Wave
         0.5 / time_between_turns(record.voltage, record.interval),
         amplifier.rate / (2 * np.pi * half),
     )
-    carriers: dict[str, Carrier] = {
-        "steady sine": Sine(half, frequency),
-        "decaying sine": Sine(half, frequency),
-        "small steady sine": Sine(half / 2, frequency),
-        "slow steady sine": Sine(half, frequency / 4),
-        "slow decaying sine": Sine(half, frequency / 4),
-        "steady triangle": Triangle(half, frequency),
-        "decaying triangle": Triangle(half, frequency),
+    carriers = {
+        "steady sine": sine(half, frequency),
+        "decaying sine": sine(half, frequency),
+        "small steady sine": sine(half / 2, frequency),
+        "slow steady sine": sine(half, frequency / 4),
+        "slow decaying sine": sine(half, frequency / 4),
+        "steady triangle": triangle(half, frequency),
+        "decaying triangle": triangle(half, frequency),
     }
-    # Reversals at all voltages: frequencies that have no common period.
+    # Reversals at all voltages: sines of frequencies that have no common period.
     golden = (np.sqrt(5) - 1) / 2
-    mean = Multisine(1.0, tuple(frequency * golden ** np.arange(3)))
+    frequencies = frequency * golden ** np.arange(3)
+
+    def mean(time: FloatArray) -> FloatArray:
+        """Return the mean of sines of one amplitude."""
+        return np.asarray(np.mean(np.sin(2 * np.pi * np.outer(frequencies, time)), axis=0))
+
     peak = np.max(np.abs(mean(np.arange(0.0, seconds, record.interval))))
-    carriers["multisine"] = replace(mean, amplitude=half / peak)
+    carriers["multisine"] = Carrier(lambda time: half / peak * mean(time), float(frequency))
     levels = [half * factor for factor in (1, -1, 0.6, -0.6, 0.3, -0.3, 0.8, -0.2, 0.5, 0)]
     dwell = seconds / len(levels)
     if 2 * half <= dwell * amplifier.rate:
-        carriers["staircase"] = Staircase(tuple(levels), dwell, amplifier.rate)
-    fading, steady = Decay(0.0, 0.9 / seconds), Decay()
+        carriers["staircase"] = staircase(levels, dwell, amplifier.rate)
+    fading = 0.9 / seconds
     return {
-        name: Waveform(
-            carrier, seconds, decay=fading if "decaying" in name else steady, bias=center
-        )
+        name: Waveform(carrier, seconds, decay=fading if "decaying" in name else 0.0, bias=center)
         for name, carrier in carriers.items()
     }
 

@@ -59,7 +59,7 @@ from bwbayes.record.io.formats import read_named, read_source
 from bwbayes.record.io.series import Source
 from bwbayes.record.record import Window
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
+from bwbayes.record.waveforms import Waveform, signal, sine, staircase, triangle
 from bwbayes.sampling.plan import SamplingPlan, best_ahead, best_ensembles_per_task, best_tries
 
 
@@ -169,13 +169,12 @@ def sampled_waveform(drive: str | SignalConfig) -> Waveform:
     """Return the waveform of that name, or the one a config describes."""
     if isinstance(drive, str):
         return signal(drive)
-    carrier: Staircase | Sine
     if drive.shape == "steps":
-        carrier = Staircase(tuple(drive.levels or ()), drive.dwell or 0.0)
+        carrier = staircase(drive.levels or (), drive.dwell or 0.0)
     else:
-        shape = Sine if drive.shape == "sine" else Triangle
+        shape = sine if drive.shape == "sine" else triangle
         carrier = shape(drive.amplitude or 0.0, drive.frequency or 0.0)
-    return Waveform(carrier, drive.duration, drive.start, Decay(drive.decay_from, drive.decay))
+    return Waveform(carrier, drive.duration, drive.start, drive.decay, drive.decay_from)
 
 
 def training_records(
