@@ -170,18 +170,6 @@ class Sections:
         return np.concatenate(responses, axis=1)
 
 
-def no_dynamics(models: int, hold: Hold) -> Recursion:
-    """Return the recursion of x = w for a batch of ``models``: all that is left is the hold.
-
-    A drive that is held changes just after the sample, so the displacement follows one sample
-    later: the limit of a lag that goes to zero.
-    """
-    if hold == "zero":
-        return first_order_lag(np.zeros(models), 1.0, hold)
-    unity = np.ones((models, 1))
-    return Recursion(unity, unity, np.empty((models, 0, 0)))
-
-
 def first_order_lag(lag: FloatArray, interval: float, hold: Hold) -> Recursion:
     """Return the recursion of τ x′ + x = w.
 
@@ -323,9 +311,16 @@ class NoDynamics(Filter):
 
     parameters: tuple[Declaration, ...] = ()
 
-    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # nothing to tell it
-        """Return x = w; see :func:`~bwbayes.model.linear.no_dynamics`."""
-        return no_dynamics(models, hold)
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # no parameters
+        """Return x = w: all that is left is the hold.
+
+        A drive that is held changes just after the sample, so the displacement follows one sample
+        later: the limit of a lag that goes to zero.
+        """
+        if hold == "zero":
+            return first_order_lag(np.zeros(models), interval, hold)
+        unity = np.ones((models, 1))
+        return Recursion(unity, unity, np.empty((models, 0, 0)))
 
 
 @dataclass(frozen=True)

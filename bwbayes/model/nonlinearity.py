@@ -7,32 +7,20 @@ so that its coefficients are displacements at the edge of the range, as large on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.declaration import Context, Declaration, Distribution, Values, normal
+from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.inputs import UNIT, Span
 
-
-class Term(NamedTuple):
-    """A power of the voltage: which, its label, and its default prior."""
-
-    power: int
-    label: str
-    default: Callable[[Context], Distribution]
-
-
-# On measured stacks the square makes a tenth of the half range or less, the cube less than that.
-TERMS = {
-    "quadratic": Term(2, r"q_2", lambda context: normal(0.0, 0.15 * context.ranges.displacement)),
-    "cubic": Term(3, r"q_3", lambda context: normal(0.0, 0.1 * context.ranges.displacement)),
-}
+# Powers of the voltage, each with its prior sd, as a part of half of the displacement's range. On
+# measured stacks the square makes a tenth of that or less, the cube less than that.
+TERMS = {"quadratic": (2, 0.15), "cubic": (3, 0.1)}
 
 
 @dataclass(frozen=True)
@@ -65,19 +53,19 @@ class PolynomialNonlinearity:
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """The coefficients, um."""
-        return tuple(
-            Declaration(
+
+        def declared(name: str, power: int, share: float) -> Declaration:
+            return Declaration(
                 name,
                 "um",
-                term.label,
+                f"q_{power}",
                 f"{name} part of the displacement at the edge of the voltage's range",
-                term.default,
+                lambda context: normal(0.0, share * context.ranges.displacement),
                 loop=True,
-                aliases=(f"q{term.power}",),
+                aliases=(f"q{power}",),
             )
-            for name, term in TERMS.items()
-            if name in self.terms
-        )
+
+        return tuple(declared(name, *TERMS[name]) for name in TERMS if name in self.terms)
 
     def scaled(self, voltage: FloatArray) -> FloatArray:
         """Return x of voltages of any shape, V."""
@@ -90,7 +78,7 @@ class PolynomialNonlinearity:
         These are (samples,), or (models, samples). A reference without any width has none.
         """
         x = self.scaled(voltage)
-        columns = [(column[name], TERMS[name].power) for name in TERMS if name in self.terms]
+        columns = [(column[name], TERMS[name][0]) for name in TERMS if name in self.terms]
         return sum(
             (q[:, np.newaxis] * x**power for q, power in columns), start=np.zeros((1, x.shape[-1]))
         )
@@ -103,7 +91,7 @@ class PolynomialNonlinearity:
         if half > 0:
             x = Polynomial([-self.reference.middle / half, 1 / half])
             for name in self.terms:
-                power = TERMS[name].power
+                power = TERMS[name][0]
                 coefficients[: power + 1] += np.outer(
                     np.asarray((x**power).coef, np.float64), column[name]
                 )

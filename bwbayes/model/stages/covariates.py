@@ -32,33 +32,6 @@ class Covariate(NamedTuple):
     symbol: str
     relative: Callable[[Ranges], float]
 
-    def coefficient(self, effect: str, symbol: str, unit: str, description: str) -> Declaration:
-        """Declare the change of something, in parts or um, with it."""
-
-        def default(context: Context) -> Distribution | float:
-            size = context.ranges.displacement if unit == "um" else 1.0
-            sd = size * self.relative(context.ranges)
-            return normal(0.0, sd) if sd else 0.0
-
-        return Declaration(
-            f"{self.name}_{effect}",
-            f"{unit}/{self.per}",
-            f"{symbol}_{self.symbol}",
-            f"{description} with the {self.name}",
-            default,
-        )
-
-    @property
-    def reference(self) -> Declaration:
-        """Declare the value from which it counts, which all stages that follow it share."""
-        return Declaration(
-            f"{self.name}_reference",
-            self.unit,
-            f"{self.symbol}_0",
-            f"{self.name} at which the displacement is that of the other parameters",
-            lambda context: context.ranges.middle_of(self.column),
-        )
-
 
 def _load_per_newton(ranges: Ranges) -> float:
     """Let half of the load's range change a tenth."""
@@ -71,24 +44,64 @@ LOAD = Covariate("load_N", "load", "N", "N", "F", _load_per_newton)
 
 
 class _Follows(Stage):
-    """Stage that follows a covariate."""
+    """Stage that follows a covariate, ``of``: a coefficient, from a value that all of them share.
+
+    The coefficient's unit is that of ``change``, 1 or um, by that of the covariate.
+    """
 
     side: ClassVar[Side] = "output"
     advice: ClassVar = "keep temperature and load constant"
     of: ClassVar[Covariate]
+    effect: ClassVar[str]
+    symbol: ClassVar[str]
+    change: ClassVar[str] = "1"
     changes: ClassVar[str]
+    described: ClassVar[str]
+    parameters: tuple[Declaration, ...] = ()
+
+    def __init_subclass__(cls, of: Covariate | None = None) -> None:
+        """Declare coefficient and reference of a stage ``of`` a covariate."""
+        super().__init_subclass__()
+        if of is None:
+            return
+
+        def coefficient(context: Context) -> Distribution | float:
+            size = context.ranges.displacement if cls.change == "um" else 1.0
+            sd = size * of.relative(context.ranges)
+            return normal(0.0, sd) if sd else 0.0
+
+        cls.of = of
+        cls.name = of.name if cls.effect == "gain" else f"{of.name}-{cls.effect}"
+        cls.sees = (*cls.sees, of.column)
+        cls.parameters = (
+            Declaration(
+                f"{of.name}_{cls.effect}",
+                f"{cls.change}/{of.per}",
+                f"{cls.symbol}_{of.symbol}",
+                f"{cls.described} with the {of.name}",
+                coefficient,
+            ),
+            Declaration(
+                f"{of.name}_reference",
+                of.unit,
+                f"{of.symbol}_0",
+                f"{of.name} at which the displacement is that of the other parameters",
+                lambda context: context.ranges.middle_of(of.column),
+            ),
+        )
 
     def describe(self, values: Mapping[str, float]) -> str:
         """Say how much a unit changes, and from where."""
-        coefficient = self.parameters[0]
-        change, reference = values[coefficient.name], values[self.of.reference.name]
-        size = f"{100 * change:+.2g}%" if coefficient.unit[0] == "1" else f"{change:+.2g} um"
+        change, reference = (values[declared.name] for declared in self.parameters)
+        size = f"{100 * change:+.2g}%" if self.change == "1" else f"{change:+.2g} um"
         start = f"{reference:.3g} {self.of.unit}"
         return f"{self.changes} by {size} per {self.of.per} from {start} on"
 
 
 class _Gain(_Follows):
-    changes: ClassVar = "displacement that changes"
+    effect, symbol = "gain", "c"
+    changes = "displacement that changes"
+    described = "relative change of the displacement"
 
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
@@ -102,7 +115,10 @@ class _Gain(_Follows):
 
 
 class _Width(_Follows):
-    changes: ClassVar = "loop whose width changes"
+    effect, symbol = "width", "w"
+    changes = "loop whose width changes"
+    described = "relative change of the loop's width, beside the displacement's,"
+    sees = ("voltage",)
 
     def numbers(self, column: Values, timing: Timing) -> FloatArray:
         """Return coefficient, reference and d, (models, 3)."""
@@ -131,7 +147,9 @@ class _Width(_Follows):
 
 
 class _Offset(_Follows):
-    changes: ClassVar = "offset that changes"
+    effect, symbol, change = "offset", "o", "um"
+    changes = "offset that changes"
+    described = "change of the offset"
 
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
@@ -144,82 +162,38 @@ class _Offset(_Follows):
         return value - parameters[0] * (parameters[2] - parameters[1])
 
 
-def _gain(of: Covariate) -> tuple[Declaration, ...]:
-    description = "relative change of the displacement"
-    return of.coefficient("gain", "c", "1", description), of.reference
-
-
-def _width(of: Covariate) -> tuple[Declaration, ...]:
-    description = "relative change of the loop's width, beside the displacement's,"
-    return of.coefficient("width", "w", "1", description), of.reference
-
-
-def _offset(of: Covariate) -> tuple[Declaration, ...]:
-    return of.coefficient("offset", "o", "um", "change of the offset"), of.reference
-
-
-class Temperature(_Gain):
+class Temperature(_Gain, of=TEMPERATURE):
     """Gain that follows the temperature: y = x (1 + c (T − T₀)), of displacement x, um.
 
     T is the covariate ``temperature_degC`` and T₀ the middle of its range in the fitted records.
     """
 
-    name: ClassVar = "temperature"
-    of: ClassVar = TEMPERATURE
-    sees: ClassVar = (TEMPERATURE.column,)
-    parameters: tuple[Declaration, ...] = _gain(TEMPERATURE)
 
-
-class TemperatureWidth(_Width):
+class TemperatureWidth(_Width, of=TEMPERATURE):
     """Loop width that follows the temperature: y = d u + (x − d u) (1 + w (T − T₀)), um.
 
     With u the voltage and d the operator's slope without hysteresis: all that departs from there
     changes, dynamics and creep included. The loop of an operator without d is all of x.
     """
 
-    name: ClassVar = "temperature-width"
-    of: ClassVar = TEMPERATURE
-    sees: ClassVar = ("voltage", TEMPERATURE.column)
-    parameters: tuple[Declaration, ...] = _width(TEMPERATURE)
 
-
-class TemperatureOffset(_Offset):
+class TemperatureOffset(_Offset, of=TEMPERATURE):
     """Offset that follows the temperature, as a mount expands: y = x + o (T − T₀), um."""
 
-    name: ClassVar = "temperature-offset"
-    of: ClassVar = TEMPERATURE
-    sees: ClassVar = (TEMPERATURE.column,)
-    parameters: tuple[Declaration, ...] = _offset(TEMPERATURE)
 
-
-class Load(_Gain):
+class Load(_Gain, of=LOAD):
     """Gain that follows the load: y = x (1 + c (F − F₀)), of displacement x, um.
 
     F is the covariate ``load_N`` and F₀ the middle of its range in the fitted records.
     """
 
-    name: ClassVar = "load"
-    of: ClassVar = LOAD
-    sees: ClassVar = (LOAD.column,)
-    parameters: tuple[Declaration, ...] = _gain(LOAD)
 
-
-class LoadWidth(_Width):
+class LoadWidth(_Width, of=LOAD):
     """Loop width that follows the load: y = d u + (x − d u) (1 + w (F − F₀)), um.
 
     u and d are those of ``temperature-width``.
     """
 
-    name: ClassVar = "load-width"
-    of: ClassVar = LOAD
-    sees: ClassVar = ("voltage", LOAD.column)
-    parameters: tuple[Declaration, ...] = _width(LOAD)
 
-
-class LoadOffset(_Offset):
+class LoadOffset(_Offset, of=LOAD):
     """Offset that follows the load, as a spring gives way: y = x + o (F − F₀), um."""
-
-    name: ClassVar = "load-offset"
-    of: ClassVar = LOAD
-    sees: ClassVar = (LOAD.column,)
-    parameters: tuple[Declaration, ...] = _offset(LOAD)
