@@ -20,7 +20,7 @@ made of what :mod:`bwbayes.arrays` says.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,14 +29,6 @@ from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, check
 from bwbayes.model.inputs import PIECE, Span, monotone_stretches
 from bwbayes.shown import brief
-
-
-class StepResult(NamedTuple):
-    """The state at a voltage: w (models,), um, dw/du (models,), and the memory."""
-
-    w: FloatArray
-    slope: FloatArray
-    memory: FloatArray
 
 
 class HysteresisStep(ABC):
@@ -87,10 +79,12 @@ class HysteresisStep(ABC):
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return what the equation of the first model has: numbers by name, and their units."""
 
-    def apply(self, memory: FloatArray, voltage: FloatArray) -> StepResult:
-        """Return what is once the voltage has gone there; the memory that is given stays."""
+    def apply(
+        self, memory: FloatArray, voltage: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return w, dw/du and the memory once the voltage has gone there; that given stays."""
         after = np.empty_like(memory)
-        return StepResult(*self.move(self.parameters.T, memory.T, voltage, after.T), after)
+        return *self.move(self.parameters.T, memory.T, voltage, after.T), after
 
 
 class OneStateStep(HysteresisStep):
@@ -120,7 +114,7 @@ class OneStateStep(HysteresisStep):
         ``state`` (models,), um, is h at its first sample.
         """
         w = np.empty((state.size, voltage.size))
-        w[:, 0] = self.apply(self._at(voltage[0], state), np.full(state.size, voltage[0])).w
+        w[:, 0], _, _ = self.apply(self._at(voltage[0], state), np.full(state.size, voltage[0]))
         if np.ptp(voltage) == 0:
             w[:] = w[:, :1]
             return w, state

@@ -87,7 +87,7 @@ def prepared(
     state = step.remembered(memory)
     if isinstance(step, RelaxingStep):
         return CompiledDrive(None, Relaxing.of(step, state, voltage[0]))
-    equilibrium = step.apply(state, np.full(len(state), voltage[0])).w
+    equilibrium, _, _ = step.apply(state, np.full(len(state), voltage[0]))
     return CompiledDrive(step, Stepped(step.parameters, np.array(state), equilibrium))
 
 

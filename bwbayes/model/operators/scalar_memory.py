@@ -96,7 +96,7 @@ class OneState(Operator):
         if not from_rest:
             return step.remembered(StateMemory(voltage, self.first_state(column, voltage)))
         at_zero = step.remembered(StateMemory(0.0, self.first_state(column, 0.0)))
-        return step.apply(at_zero, voltage).memory
+        return step.apply(at_zero, voltage)[2]
 
     def first_state(self, column: Values, voltage: float | FloatArray) -> FloatArray:  # noqa: ARG002  # any
         """Return the state (models,) that ``initial`` means at a voltage, V: by default itself."""
@@ -307,37 +307,6 @@ class RelaxingStep(OneStateStep):
         w = voltage * (parameters[0] + voltage * (parameters[1] + voltage * parameters[2])) - s * g
         slope = parameters[0] + voltage * (2.0 * parameters[1] + 3.0 * voltage * parameters[2])
         return w, slope - (alpha + voltage * (alpha1 + voltage * alpha2)) + rate * g
-
-    def along(
-        self, start: float, state: FloatArray, voltage: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return w and h along voltages that go one way, as of :class:`OneStateStep`."""
-        d, d2, d3 = self.parameters.T[:3, :, np.newaxis]
-        s = -1.0 if voltage[-1] < start else 1.0
-        g, early = np.empty((state.size, voltage.size)), 0
-        if self.signed and s * start < 0.0:
-            # At zero volts the rates change.
-            early = int(np.searchsorted(s * voltage, 0.0))
-            to_zero = np.append(voltage[:early], 0.0)
-            before = self._with_sign(-s, s, start, s * state, to_zero)
-            g[:, :early], state, start = before[:, :-1], s * before[:, -1], 0.0
-        if early < voltage.size:
-            g[:, early:] = self._with_sign(s, s, start, s * state, voltage[early:])
-        h = s * g
-        return voltage * (d + voltage * (d2 + voltage * d3)) - h, h
-
-    def _with_sign(
-        self, sign: float, s: float, start: float, g: FloatArray, voltage: FloatArray
-    ) -> FloatArray:
-        """Return g = s h (models, samples) along voltages (samples,) with a sign, from a start."""
-        numbers, pair = self.parameters.T[:, :, np.newaxis], 2 * (s > 0) + (sign > 0)
-        alpha, alpha1, alpha2, against = *numbers[3:6], numbers[6 + pair]
-        strength, tilt = alpha + start * (alpha1 + start * alpha2), alpha1 + 2.0 * start * alpha2
-        lowest = np.where(against < 0.0, INSIDE * strength / against, -np.inf)
-        begin, travel = np.maximum(g[:, np.newaxis], lowest), np.abs(voltage - start)
-        ahead, bend = numbers[10 + pair], 2.0 * alpha2
-        g, _ = relaxed(begin, travel, strength, s * tilt, bend, against, ahead)
-        return g
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d − α + c g at the ceilings: h is steepest just after a turn. f and a are even."""

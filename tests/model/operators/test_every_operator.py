@@ -191,13 +191,13 @@ def test_the_slope_of_a_step_is_that_of_its_displacement(name: str) -> None:
     )
     operator.check({**column, "initial": np.zeros_like(column["d"])})
     step = operator.step(column)
-    turned = step.apply(step.demagnetized(), np.linspace(-90.0, 90.0, column["d"].size))
+    ways = np.linspace(-90.0, 90.0, column["d"].size)
+    _, _, turned = step.apply(step.demagnetized(), ways)
     for voltage in (59.0, 20.0, -40.0, -90.0):
-        low, middle, high = (
-            step.apply(turned.memory, np.full_like(turned.w, voltage + part))
-            for part in (-1e-4, 0.0, 1e-4)
+        (low, _, _), (_, slope, _), (high, _, _) = (
+            step.apply(turned, np.full_like(ways, voltage + part)) for part in (-1e-4, 0.0, 1e-4)
         )
-        off = np.abs((high.w - low.w) / 2e-4 - middle.slope) / np.abs(column["d"])
+        off = np.abs((high - low) / 2e-4 - slope) / np.abs(column["d"])
         assert np.median(off) < 1e-6
 
 
