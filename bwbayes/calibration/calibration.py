@@ -126,19 +126,6 @@ class Entry(TypedDict):
 
 
 @dataclass(frozen=True)
-class Sampled:
-    """A posterior that was sampled: its ``draws`` (draws, free), and the ``point`` fit.
-
-    Parameters are in their own units.
-    """
-
-    __repr__ = brief
-
-    draws: FloatArray
-    point: MAPEstimate
-
-
-@dataclass(frozen=True)
 class CalibrationSetup:
     """The setup that all replicates share.
 
@@ -161,8 +148,9 @@ class CalibrationSetup:
         Where truths and records come from, if not from ``posterior``, whose parameters it must
         include. A calibration then must fail: on records that the analysis is wrong about.
     around
-        The posterior's own draws, if truths come from these and not from its prior. The
-        readings behind these draws are then fitted with each replicate, and no bands are predicted.
+        The posterior's own draws (draws, free), in their own units, and its point fit, if truths
+        come from these and not from its prior. The readings behind these draws are then fitted
+        with each replicate, and no bands are predicted.
     """
 
     __repr__ = brief
@@ -172,7 +160,7 @@ class CalibrationSetup:
     held_out: Mapping[str, Sequence[slice]] = field(default_factory=dict)
     others: Mapping[str, Validation] = field(default_factory=dict)
     source: Posterior | None = None
-    around: Sampled | None = None
+    around: tuple[FloatArray, MAPEstimate] | None = None
 
     @property
     def truth(self) -> Posterior:
@@ -258,7 +246,7 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
         point = (
             pointfit.fit(posterior, fitting)
             if around is None
-            else pointfit.refit(posterior, around.point)
+            else pointfit.refit(posterior, around[1])
         )
         chain = init_chain(posterior, point, experiment.plan, sampling)
         with ThreadPoolExecutor(1) as executor:
@@ -298,9 +286,7 @@ def _simulated(
     """Draw a truth; return it by parameter, (1,) each, and its records by name."""
     source, around = experiment.truth, experiment.around
     free = (
-        source.prior.draw(generator, 1)
-        if around is None
-        else generator.choice(around.draws, size=1)
+        source.prior.draw(generator, 1) if around is None else generator.choice(around[0], size=1)
     )
     theta = source.prior.theta(free)
     column = source.table.columns(theta)

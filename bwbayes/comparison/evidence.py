@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -40,14 +39,6 @@ from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
-
-
-class Bridge(NamedTuple):
-    """The log of an unknown integral, nats, its standard error, and effective draws behind it."""
-
-    log_integral: float
-    error: float
-    effective: float
 
 
 @dataclass(frozen=True)
@@ -130,15 +121,15 @@ def evidence(
     places, proposed = proposal.evaluate(proposal.draw(random, 10_000))
     densities = [*map(posterior.log_density, watched(np.array_split(places, 20), watch))]
     at_places = np.concatenate(densities) - proposed
-    bridged = bridge(at_draws, at_places)
+    log_integral, error, effective = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)
-    log_evidence = bridged.log_integral + constant - mass
+    log_evidence = log_integral + constant - mass
     return Evidence(
         log_evidence,
-        float(np.hypot(bridged.error, mass_error)),
+        float(np.hypot(error, mass_error)),
         mass,
-        bridged.effective,
+        effective,
         float(np.mean(log_likelihood)) - log_evidence,
         float(np.max(log_likelihood)),
     )
@@ -160,7 +151,7 @@ def screening_evidence(
     return Evidence(log_evidence, np.inf, mass, 0.0, share, float(log_likelihood))
 
 
-def bridge(at_draws: FloatArray, at_places: FloatArray) -> Bridge:
+def bridge(at_draws: FloatArray, at_places: FloatArray) -> tuple[float, float, float]:
     """Bridge from a known integral to an unknown one: the ratio r = ∫p / ∫q.
 
     With weights w = p/q at draws of p and at places from q, the optimal bridge solves
@@ -168,7 +159,8 @@ def bridge(at_draws: FloatArray, at_places: FloatArray) -> Bridge:
         r = mean over places of [w / (s w + (1 − s) r)] / mean over draws of [1 / (s w + (1 − s) r)]
 
     with s = n / (n + N), n effective draws and N places. The relative error follows from the
-    variances of both means, that of the draws divided by their effective number.
+    variances of both means, that of the draws divided by their effective number. Returns log r,
+    nats, its standard error, and the effective draws of p.
 
     Parameters
     ----------
@@ -205,7 +197,7 @@ def bridge(at_draws: FloatArray, at_places: FloatArray) -> Bridge:
     scaled = [np.exp(end - np.max(end)) for end in ends]
     variances = [np.var(end) / np.mean(end) ** 2 for end in scaled]
     error = float(np.sqrt(variances[0] / effective + variances[1] / places.size))
-    return Bridge(log_r + shift, error if np.isfinite(error) else np.inf, effective)
+    return log_r + shift, error if np.isfinite(error) else np.inf, effective
 
 
 def _effective(values: FloatArray) -> float:

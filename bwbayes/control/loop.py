@@ -105,18 +105,6 @@ class LoopPlan(NamedTuple):
     begins: int
 
 
-class TrackingErrors(NamedTuple):
-    """How well: ``rms`` and ``largest`` error, um, and the share of samples at a limit.
-
-    All are (controllers, signals, draws). The error is that of the actuator itself in true um, its
-    discrepancy included, not of the readings.
-    """
-
-    rms: FloatArray
-    largest: FloatArray
-    limited: FloatArray
-
-
 def plan_loops(
     model: SampledModel,
     references: Sequence[tuple[FloatArray, int]],
@@ -176,8 +164,11 @@ def follow(
     watch: Watch = unwatched,
     *,
     true: Callable[[FloatArray], FloatArray] = np.positive,
-) -> TrackingErrors:
-    """Close the loop around every draw.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Close the loop around every draw; return rms and largest error, um, and the share limited.
+
+    All are (controllers, signals, draws). The error is that of the actuator itself in true um, its
+    discrepancy included, not of the readings; the share is that of the samples at a limit.
 
     The ``draws`` are the actuators, whose voltage is held between samples: a row for every
     controller, signal and draw, in this order. The ``generator`` is the source of discrepancy and
@@ -222,7 +213,7 @@ def follow(
             limited += (command <= low) | (command >= high) | (held != level)
         state = draws.forward(state, held.ravel())[1]
     judged = samples - plan.begins
-    return TrackingErrors(np.sqrt(squares / judged), largest, limited / judged)
+    return np.sqrt(squares / judged), largest, limited / judged
 
 
 # Where loops are looked at, rad per sample.

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import scipy
+from scipy.optimize import elementwise
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
@@ -307,11 +308,6 @@ def solve_branch(
         A first guess of how far the path goes, V.
     resolution
         Tolerance of a travel, V.
-
-    Notes
-    -----
-    C. Ridders, A new algorithm for computing a single root of a real continuous function, IEEE
-    Transactions on Circuits and Systems 26, 979-980 (1979), within brackets from a coarse walk.
     """
     reach = min(guess, room)
     while reach < room and curve(np.array([reach]))[0] < rise[-1]:
@@ -319,34 +315,25 @@ def solve_branch(
     points = reach * np.linspace(0.0, 1.0, 33)
     heights = np.maximum.accumulate(np.concatenate([[0.0], curve(points[1:])]))
     above = np.clip(np.searchsorted(heights, rise), 1, points.size - 1)
+    travel = np.where(rise <= 0, 0.0, reach)
     # Those that are not reached, or not left, need no search.
-    low = np.where(rise <= 0, 0.0, np.where(rise >= heights[-1], reach, points[above - 1]))
-    high = np.where((rise <= 0) | (rise >= heights[-1]), low, points[above])
-    below, beyond = heights[above - 1] - rise, heights[above] - rise
+    sought = (rise > 0) & (rise < heights[-1])
+    if not sought.any():
+        return travel
 
-    def excess(travel: FloatArray) -> FloatArray:
+    def excess(travel: FloatArray, rise: FloatArray) -> FloatArray:
         # Travels in any order are walked along as a path.
         order = np.argsort(travel, kind="stable")
         values = np.empty_like(travel)
         values[order] = curve(travel[order])
         return values - rise
 
-    latest = low
-    for _ in range(60):
-        midpoint = (low + high) / 2
-        between = excess(midpoint)
-        root = np.sqrt(np.maximum(between**2 - below * beyond, 0.0))
-        step = np.divide(between, root, out=np.zeros_like(root), where=root > 0)
-        before, latest = latest, np.clip(midpoint - (midpoint - low) * step, low, high)
-        value = excess(latest)
-        for voltage_tried, height in ((midpoint, between), (latest, value)):
-            under = height < 0
-            low, below = np.where(under, voltage_tried, low), np.where(under, height, below)
-            high, beyond = np.where(under, high, voltage_tried), np.where(under, beyond, height)
-        settled = np.abs(latest - before) <= resolution
-        if (settled | (value == 0) | (high - low <= resolution)).all():
-            break
-    return latest
+    brackets = points[above[sought] - 1], points[above[sought]]
+    tolerances = {"xatol": resolution, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
+    travel[sought] = elementwise.find_root(
+        excess, brackets, args=(rise[sought],), tolerances=tolerances, maxiter=100
+    ).x
+    return travel
 
 
 def undone(recursion: Recursion, displacement: FloatArray) -> FloatArray:

@@ -18,7 +18,6 @@ from bwbayes.calibration.calibration import (
     CalibrationSetup,
     Entry,
     Replicate,
-    Sampled,
     evaluate_calibration,
     holm,
     replicate,
@@ -116,7 +115,7 @@ def around() -> CalibrationSetup:
         assert sample(posterior, PLAN, chain, executor).converged
     flat = draws(posterior, chain).reshape(-1, len(posterior.names))
     plan = replace(PLAN, ahead=10, tries=4)
-    return CalibrationSetup(posterior, plan, around=Sampled(flat, point))
+    return CalibrationSetup(posterior, plan, around=(flat, point))
 
 
 def calibrated(experiment: CalibrationSetup, count: int) -> Calibration:
@@ -126,10 +125,10 @@ def calibrated(experiment: CalibrationSetup, count: int) -> Calibration:
 
 def moved(experiment: CalibrationSetup, shift: float, width: float) -> CalibrationSetup:
     assert experiment.around is not None
-    sampled = experiment.around.draws
+    sampled, point = experiment.around
     middle = np.mean(sampled, axis=0)
     wrong = middle + shift * np.std(sampled, axis=0) + width * (sampled - middle)
-    return replace(experiment, around=replace(experiment.around, draws=wrong))
+    return replace(experiment, around=(wrong, point))
 
 
 def test_ranks_around_a_posterior_are_even(around: CalibrationSetup) -> None:

@@ -38,7 +38,6 @@ from bwbayes.calibration.calibration import (
     Calibration,
     CalibrationSetup,
     Entry,
-    Sampled,
     evaluate_calibration,
     replicate,
 )
@@ -183,7 +182,7 @@ def calibrate(
     flat = thin_draws(flat, fit.study.generator("truths"))
     # A rank among 199 draws needs no more.
     plan = replace(fit.plan, ess=min(fit.plan.ess, 2.0 * RANKED))
-    common = CalibrationSetup(posterior, plan, around=Sampled(flat, fit.chain.point))
+    common = CalibrationSetup(posterior, plan, around=(flat, fit.chain.point))
     with fit.folder.locked(), one_thread():
         if overwrite or not folder.replicates.exists():
             shutil.rmtree(folder.path, ignore_errors=True)
