@@ -202,9 +202,6 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-# Samples of a long record that are replicated, after its voltage has been nearly everywhere.
-SAMPLES = 100_000
-
 # Statistics that are compared: title and unit for people.
 STATISTICS: Mapping[str, tuple[str, str]] = {
     "range_um": ("Range of the readings", "um"),
@@ -285,7 +282,7 @@ def check_predictions(
     watch
         Called with the share that is done.
     """
-    posterior = beginning(posterior, SAMPLES)
+    posterior = beginning(posterior, 100_000)  # by then the voltage has been nearly everywhere
     dataset = (
         posterior.single_record if record is None else posterior.for_record(record).single_record
     )

@@ -330,7 +330,7 @@ def solve_branch(
 
     brackets = points[above[sought] - 1], points[above[sought]]
     tolerances = {"xatol": resolution, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
-    travel[sought] = elementwise.find_root(
+    travel[sought] = elementwise.find_root(  # type: ignore[call-overload]  # asks for keywords
         excess, brackets, args=(rise[sought],), tolerances=tolerances, maxiter=100
     ).x
     return travel

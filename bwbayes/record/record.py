@@ -171,18 +171,20 @@ class Record(Inputs):
             raise InputError(f"{origin}: units: interval is in s; leave out that of the time")
         if interval is not None and not 0 < interval < np.inf:
             raise InputError(f"{origin}: interval: {interval} s is not a positive time")
-        named: dict[str, Any] = {"units": units, "input": input, "output": output}
-        stated_naming = Naming.stated(**named, covariates=tuple(covariates or ()))
-        names = stated_naming.quantities.input.name, stated_naming.quantities.output.name
+        stated_naming = Naming.stated(
+            units=units, covariates=tuple(covariates or ()), input=input, output=output
+        )
+        quantities = stated_naming.quantities
+        names = quantities.input.name, quantities.output.name
         arrays = {"time": time, names[0]: voltage, names[1]: displacement}
         source = array_source(origin, arrays | dict(covariates or {}), interval, start or 0.0)
         common = {"time": "s", "voltage": "V", "displacement": "um"}
-        if stated_naming.quantities.input != VOLTAGE:
+        if quantities.input != VOLTAGE:
             del common["voltage"]
-        if stated_naming.quantities.output != DISPLACEMENT:
+        if quantities.output != DISPLACEMENT:
             del common["displacement"]
         columns: dict[str, str | int] = {}
-        if not stated_naming.quantities.are_default:
+        if not quantities.are_default:
             columns = {"voltage": names[0]}
             columns |= {} if displacement is None else {"displacement": names[1]}
         naming = replace(stated_naming, units=common | dict(stated_naming.units), columns=columns)
@@ -227,13 +229,9 @@ class Record(Inputs):
         """
         names = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in names.items() if name is not None}
-        named: dict[str, Any] = {
-            "columns": columns,
-            "units": units,
-            "input": input,
-            "output": output,
-        }
-        naming = Naming.stated(**named, fs=fs, covariates=covariates)
+        naming = Naming.stated(
+            columns=columns, units=units, fs=fs, covariates=covariates, input=input, output=output
+        )
         return cls._of(frame_source(frame, origin), naming, voltage_is, displacement is not None)
 
     @classmethod

@@ -338,6 +338,8 @@ def relaxed(
     dg/dv = a − c g, with the rate c against for g < 0 and ahead from there on, 1/V, and a, um/V, at
     first the strength, with the first derivative tilt and the second one bend by v.
     """
+    unstable = (travel > 0.0) & (g < 0.0) & (against < 0.0)
+    g = select(unstable, np.maximum(g, INSIDE * strength / against), g)
     rate = select(g < 0.0, against, ahead)
     reached = relax(g, travel, strength, rate, phi(rate * travel))
     if anywhere((tilt != 0.0) | (bend != 0.0)):

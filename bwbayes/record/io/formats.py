@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import h5py
@@ -133,16 +133,17 @@ def read_record(
         If columns are ignored, a column is recognized by nothing but its unit, samples are missing,
         or times are not uniform.
     """
-    named: dict[str, Any] = {
-        "columns": columns,
-        "units": units,
-        "fs": fs,
-        "table": table,
-        "input": input,
-    }
-    named |= {"displacement_file": displacement_file, "covariates": covariates, "output": output}
-    named |= {"linearity": linearity}
-    naming = Naming.stated(**named)
+    naming = Naming.stated(
+        columns=columns,
+        units=units,
+        fs=fs,
+        table=table,
+        displacement_file=displacement_file,
+        covariates=covariates,
+        input=input,
+        output=output,
+        linearity=linearity,
+    )
     with naming.quantities.spoken():
         return read_named(Path(path), naming, voltage_is, need_displacement)
 

@@ -158,6 +158,16 @@ def test_bouc_wen_stays_below_its_ceiling_however_fine_the_path(
     np.testing.assert_allclose(got, h, rtol=0, atol=close)
 
 
+@pytest.mark.parametrize("gamma", [0.1, 1.0, 10.0])
+def test_a_sharp_loop_stays_below_its_ceiling(gamma: float) -> None:
+    """With β = 0 a turn at the ceiling is an unstable rest, where rounding grows by e^(γ v)."""
+    turns = (0, 100), (100, -100), (-100, 100), (100, -100)
+    sweeps = [np.linspace(*ends, 333) for ends in turns]
+    alpha = np.linspace(0.1, 1.0, 50)
+    h = hysteresis(np.concatenate(sweeps), alpha, 0.0, gamma)
+    assert (np.abs(h).max(axis=1) <= alpha / gamma * (1 + 1e-11)).all()
+
+
 # What passes for an energy, h²/(2 α), never grows by more than is supplied.
 signs = st.floats(-0.6, 0.6)
 
