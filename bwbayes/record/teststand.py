@@ -30,10 +30,9 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Distribution, Ranges
 from bwbayes.model.linear import first_order_lag
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
-from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.duhem import BacklashLike, Duhem
 from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.record.record import Record
 from bwbayes.record.waveforms import Waveform

@@ -30,8 +30,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs, Limits
-from bwbayes.model.stages.covariates import Temperature, TemperatureOffset
-from bwbayes.model.stages.gain import MovingGain
+from bwbayes.model.stages.gain import MovingGain, Temperature, TemperatureOffset
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record import Record, write_record
 from bwbayes.record.io.binary import record_arrays

@@ -9,10 +9,9 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Hold, Span
 from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
-from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.duhem import BacklashLike, Duhem
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.prandtl_ishlinskii import MaxwellSlip, Plays
 

@@ -35,7 +35,7 @@ from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
 from bwbayes.model.stages.amplifier_limits import Saturation
-from bwbayes.model.stages.covariates import Temperature
+from bwbayes.model.stages.gain import Temperature
 from bwbayes.model.stages.lags import Delay
 from bwbayes.record.teststand import RING_BENDER, true_values
 from tests.control.compiled import Compiled

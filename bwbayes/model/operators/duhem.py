@@ -2,7 +2,8 @@
 
 Its loops may be curved and wider where the voltage is far from zero, which plain Bouc-Wen loops
 are not: the gain behind the hysteresis and the strength of the hysteresis are polynomials of the
-voltage. With constants for both, it is the backlash-like model.
+voltage. With constants for both, it is backlash-like hysteresis: a loop that opens and settles at
+the same rate in both directions.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from bwbayes.model.operators.scalar_memory import (
     RelaxingStep,
     alpha,
     beta,
+    ceiling,
     d,
     initial,
 )
@@ -160,6 +162,36 @@ class DuhemStep(RelaxingStep):
         d, d2, d3, alpha, alpha1, alpha2 = numbers[:6]
         slope = d - alpha + rising * (2 * d2 - alpha1 + rising * (3 * d3 - alpha2))
         return (slope - farthest).min(axis=1), (slope + farthest).max(axis=1)
+
+
+@dataclass(frozen=True)
+class BacklashLike(OneState):
+    """Backlash-like hysteresis of Su and others, exact.
+
+    The displacement w in um follows the voltage u in V by
+
+        dw = a |du| (c u − w) + b du.
+
+    With h = c u − w this is dh = (c − b) du − a |du| h: n = 1 Bouc-Wen hysteresis with d = c,
+    α = c − b, β = a and γ = 0, so d, α (um/V) and β (1/V) are its parameters. The slope at rest, b,
+    is positive where α < d.
+
+    Notes
+    -----
+    C.-Y. Su, Y. Stepanenko, J. Svoboda, T. P. Leung, Robust adaptive control of a class of
+    nonlinear systems with unknown backlash-like hysteresis, IEEE Transactions on Automatic Control
+    45 (2000).
+    """
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """d, α, β and the initial h."""
+        start = initial(lambda e: (-(top := ceiling(e["alpha"], e["beta"])), top))
+        return d(), alpha(), beta(), start
+
+    def step(self, column: Values) -> HysteresisStep:
+        """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""
+        return RelaxingStep.of([column["d"]], [column["alpha"]], column["beta"], column["beta"])
 
 
 def _coefficient(name: str, power: int, label: str, description: str) -> Declaration:

@@ -12,10 +12,9 @@ from scipy.special import hyp2f1
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.operators import pinned
-from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen, PowerStep, ceiling, hysteresis
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
-from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.duhem import BacklashLike, Duhem
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from bwbayes.model.operators.scalar_memory import OneState
 from tests.model.operators.slow import (

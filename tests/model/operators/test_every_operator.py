@@ -16,10 +16,9 @@ from bwbayes.model.inputs import Span
 from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator
-from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
-from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.duhem import BacklashLike, Duhem
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.model.registry import HYSTERESIS, build_part
