@@ -28,9 +28,7 @@ SHORTEST, LONGEST = 10, 10**7
 APPROACH = 1.0
 
 
-def _triangle(turns: FloatArray) -> FloatArray:
-    return np.asarray(scipy.signal.sawtooth(2 * np.pi * (turns + 0.25), 0.5))
-
+_triangle = triangle(1.0, 1.0).voltage
 
 # A raster writes its line in 0.9 of a period; the rest is the way back.
 SHAPES: Mapping[str, Callable[[FloatArray, int], FloatArray]] = {
@@ -197,7 +195,7 @@ def tracking_signals(
         sine,
         sine * (1 - turns / end),
         steps,
-        np.round(5 * triangle(1.0, 1.0).voltage(turns)) / 5,
+        SHAPES["staircase"](turns, 5),
     )
     kernel = np.hanning(rise + 2)[1:-1]
     smoothed = [
