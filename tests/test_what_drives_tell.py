@@ -17,7 +17,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.record import Record, write_record
-from bwbayes.record.teststand import RingBender, VirtualTestStand
+from bwbayes.record.teststand import TABLE_1, VirtualTestStand
 from bwbayes.record.waveforms import Waveform, sine, staircase
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
@@ -61,8 +61,8 @@ def fitted(record: Record, **model: Any) -> tuple[bw.Run, float, float]:
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 def test_what_drives_tell_of_each_parameter() -> None:
     """SDs over the true values, %; all truths lie within four SDs of the means."""
-    truth = {name: getattr(RingBender, name) for name in ("d", "alpha", "beta", "gamma")}
-    truth["lag"] = RingBender.damping / RingBender.stiffness
+    truth = {name: TABLE_1[name] for name in ("d", "alpha", "beta", "gamma")}
+    truth["lag"] = TABLE_1["damping"] / TABLE_1["stiffness"]
     percent: dict[str, dict[str, dict[str, float]]] = {}
     for name, drive in DRIVES.items():
         percent[name] = {}

@@ -17,8 +17,9 @@ import itertools
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -43,24 +44,21 @@ PROCESS_SD = 1.5  # um
 PROCESS_TIME = 0.5  # s
 
 
-@dataclass(frozen=True)
-class RingBender:
-    """The actuator's parameters: Table 1 of the paper, alpha read as um/V.
-
-    ``d`` and ``alpha`` in um/V, ``beta`` and ``gamma`` in 1/V (at exponent 1), ``initial`` in um,
-    ``mass`` in kg, ``damping`` in N s/m, ``stiffness`` in N/m, ``offset`` in um.
-    """
-
-    d: float = 0.7
-    alpha: float = 0.3575
-    beta: float = 0.0272
-    gamma: float = 0.0172
-    exponent: float = 1.0
-    initial: float = 0.0
-    mass: float = 0.00134
-    damping: float = 1580.0
-    stiffness: float = 4.10e5
-    offset: float = 0.0
+# The actuator's parameters: Table 1 of the paper, alpha read as um/V; beta and gamma at exponent 1.
+TABLE_1: Mapping[str, float] = MappingProxyType(
+    {
+        "d": 0.7,  # um/V
+        "alpha": 0.3575,  # um/V
+        "beta": 0.0272,  # 1/V
+        "gamma": 0.0172,  # 1/V
+        "exponent": 1.0,
+        "initial": 0.0,  # um
+        "mass": 0.00134,  # kg
+        "damping": 1580.0,  # N s/m
+        "stiffness": 4.10e5,  # N/m
+        "offset": 0.0,  # um
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -288,7 +286,7 @@ class VirtualTestStand:
     @cached_property
     def _values(self) -> dict[str, float]:
         """The true values of the actuator's parameters."""
-        return true_values(self.actuator, asdict(RingBender())) | dict(self.true)
+        return true_values(self.actuator, TABLE_1) | dict(self.true)
 
     @property
     def _from_rest(self) -> bool:

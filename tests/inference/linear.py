@@ -7,7 +7,7 @@ model's columns from the plain model in ``tests.reference`` and the noise's dens
 are about as wide as the likelihood, so that both count, and their means are an sd off the truth.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Distribution
-from bwbayes.record.teststand import RingBender
+from bwbayes.record.teststand import TABLE_1
 from tests.inference.problems import (
     INTERVAL,
     TRUE_LAG,
@@ -31,7 +31,7 @@ from tests.reference.plain import Case, simulate
 
 SAMPLES = 120
 WINDOWS = (slice(8, 60), slice(75, 120))
-TRUTH = MappingProxyType(asdict(RingBender()) | {"lag": TRUE_LAG} | TRUE_NOISE)
+TRUTH = MappingProxyType(dict(TABLE_1) | {"lag": TRUE_LAG} | TRUE_NOISE)
 
 PRIOR_SDS: MappingProxyType[str, dict[str, float]] = MappingProxyType(
     {

@@ -14,7 +14,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
 from bwbayes.model.inputs import Hold, Inputs
 from bwbayes.record.record import Record
-from bwbayes.record.teststand import RingBender
+from bwbayes.record.teststand import TABLE_1
 from tests.declared import NAMES, context, declared, joint, parameter
 from tests.stand import process
 
@@ -33,16 +33,14 @@ def decaying_sine(samples: int, periods: float = 4.0, amplitude: float = 100.0) 
 
 def truth(posterior: Posterior) -> FloatArray:
     """Return the θ (1, parameters) that the simulated records come from."""
-    table = RingBender()
-    known = {**{n: getattr(table, n, 0.0) for n in NAMES}, **TRUE_NOISE, "lag": TRUE_LAG}
+    known = {**{n: TABLE_1.get(n, 0.0) for n in NAMES}, **TRUE_NOISE, "lag": TRUE_LAG}
     return np.array([[known[name] for name in posterior.prior.names]])
 
 
 def ring_bender(actuator: Actuator, noise: str, voltage: FloatArray, seed: int) -> FloatArray:
     """Simulate the displacement (samples,) of the paper's ring bender, um."""
     generator = np.random.default_rng(seed)
-    table = RingBender()
-    theta = [TRUE_LAG if n == "lag" else getattr(table, n) for n in actuator.parameters]
+    theta = [TRUE_LAG if n == "lag" else TABLE_1[n] for n in actuator.parameters]
     clean = actuator.displacement(np.array([theta]), voltage)[0]
     reading: FloatArray = clean + TRUE_NOISE["sensor_sd"] * generator.standard_normal(voltage.size)
     if noise == "white":

@@ -17,7 +17,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Distribution, Ranges
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.operators.bouc_wen import ceiling
-from bwbayes.record.teststand import RingBender
+from bwbayes.record.teststand import TABLE_1
 from tests.declared import NAMES as EVERY, context, declared, joint, parameter
 from tests.inference.problems import joint_prior, single
 
@@ -245,8 +245,7 @@ def drive(amplitude: float = 100.0, interval: float = 1e-3, bias: float = 0.0) -
 def displacement(voltage: FloatArray, interval: float = 1e-3) -> FloatArray:
     """Return that of the ring bender with a lag of 20 ms, um."""
     actuator = Actuator("lag", "first", interval)
-    table = RingBender()
-    theta = [0.02 if n == "lag" else getattr(table, n) for n in actuator.parameters]
+    theta = [0.02 if n == "lag" else TABLE_1[n] for n in actuator.parameters]
     clean: FloatArray = actuator.displacement(np.array([theta]), voltage)[0]
     return clean
 

@@ -1,6 +1,6 @@
 """The voltage for a displacement, whatever the actuator is made of, gives that displacement."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +15,7 @@ from bwbayes.model.inverse import inverse
 from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.registry import HYSTERESIS, build_part
-from bwbayes.record.teststand import RingBender
+from bwbayes.record.teststand import TABLE_1
 from tests.control import cases
 from tests.inference.problems import decaying_sine
 from tests.model.operators.test_every_operator import drawn_from, every_operator, posterior
@@ -25,7 +25,8 @@ SPAN = Span(-100.0, 100.0)
 # Of the range: what simulating the inverse may miss the reference by.
 CLOSE = 1e-9
 
-TABLE_1 = asdict(RingBender()) | {
+VALUES = {
+    **TABLE_1,
     "lag": 3.85e-3,
     "quadratic": 3.0,
     "cubic": -1.5,
@@ -37,7 +38,7 @@ TABLE_1 = asdict(RingBender()) | {
 
 
 def theta_of(actuator: Actuator, **others: float) -> FloatArray:
-    known = {**TABLE_1, **others}
+    known = {**VALUES, **others}
     return np.array([[known[name] for name in actuator.parameters]])
 
 
@@ -255,7 +256,7 @@ def test_a_displacement_beyond_saturation_is_refused_with_its_time() -> None:
     operator = build_part("hysteresis", "domain-wall", HYSTERESIS, {})
     actuator = Actuator("none", "first", 1e-3, operator, span=SPAN)
     known = {"d": 0.7, "saturation": 40.0, "coupling": 0.2, "pinning": 20.0, "reversible": 0.3}
-    theta = np.array([[{**TABLE_1, **known}[name] for name in actuator.parameters]])
+    theta = np.array([[{**VALUES, **known}[name] for name in actuator.parameters]])
     with pytest.raises(InputError, match=r"no voltage gives 60 um at 0.002 s"):
         inverse(actuator, theta, [0.0, 10.0, 60.0], from_rest=True)
     nearest = inverse(actuator, theta, [0.0, 10.0, 60.0], from_rest=True, nearest=True)

@@ -6,7 +6,7 @@ so all that bands can get wrong is the start of the record. Any operator may be 
 values that the virtual stand has for it.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from bwbayes.model.registry import HYSTERESIS, STAGES, build_part
 from bwbayes.prediction.bands import KINDS, Bands, Kind
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
-from bwbayes.record.teststand import RingBender, true_values
+from bwbayes.record.teststand import TABLE_1, true_values
 from tests.inference.problems import posterior_of
 from tests.prediction.runs import covered as inside
 from tests.stand import process
@@ -34,7 +34,7 @@ KNOCK = 20.0
 # Draws of the start: they are spread evenly, so that few will do.
 DRAWS = 64
 
-TRUE = asdict(RingBender()) | {
+TRUE = dict(TABLE_1) | {
     "sensor_sd": 0.1,
     "discrepancy_time": 0.3,
     # Rings at 6 Hz, and dies out within a fifth of a second.
