@@ -131,14 +131,9 @@ class OneStateStep(HysteresisStep):
 
         From a voltage ``start``, where h is ``state`` (models,); each goes there straight.
         """
-        return self.gone_along(self._at(start, state).T, voltage)
-
-    def gone_along(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return w and h from a memory (any, models) straight to each of the voltages."""
+        numbers, memory = self.parameters.T[..., np.newaxis], self._at(start, state).T
         after = np.empty((*memory.shape, voltage.size))
-        w, _ = self.move(
-            self.parameters.T[:, :, np.newaxis], memory[:, :, np.newaxis], voltage, after
-        )
+        w, _ = self.move(numbers, memory[..., np.newaxis], voltage, after)
         return w, after[1]
 
 

@@ -116,15 +116,6 @@ class PowerStep(OneStateStep):
         x = select(time < 0.0, parameters[2], parameters[3]) * height**n
         return d * voltage - h, d - alpha * (1 - x)
 
-    def along(
-        self, start: float, state: FloatArray, voltage: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return w and h along voltages that go one way, as of :class:`OneStateStep`."""
-        s = -1.0 if voltage[-1] < start else 1.0
-        time = clock(self.parameters.T, s * state)
-        memory = np.stack(np.broadcast_arrays(start, state, s, time))
-        return self.gone_along(memory, voltage)
-
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return d − max(α, 2 α β / (β + γ)) and d: h is steepest just after a turn."""
         d, alpha, below, _, _, scale, n = self.parameters.T[:TABLE]
