@@ -250,7 +250,7 @@ def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArr
         return stated
     low, high = slopes
     unsure = (high - low) / 2 * steps
-    return _exact_interval(table, (low + high) / 2, unsure, unsure / 2, steps)
+    return _exact_interval(table, (low + high) / 2, unsure, unsure / 2, steps, or_rate=True)
 
 
 def _half_units(values: FloatArray) -> FloatArray | None:
@@ -376,10 +376,12 @@ def _exact_interval(
     tolerance: float,
     rounding: float,
     steps: int,
+    *,
+    or_rate: bool = False,
 ) -> float:
     """Return the interval that the file declares, if its times agree, or else the roundest one.
 
-    The interval of a round rate counts as round, too.
+    With ``or_rate``, the interval of a round rate counts as round, too.
     """
     text = table.notes.get("interval_s")
     if text is None:
@@ -391,8 +393,8 @@ def _exact_interval(
         unsure = max(rounding / steps, 5e-13 * measured)
         rounded = []
         for digits in range(1, 13):
-            rounded.append(float(f"{measured:.{digits}g}"))
-            rounded.append(1 / float(f"{1 / measured:.{digits}g}"))
+            rounded += [float(f"{measured:.{digits}g}")]
+            rounded += [1 / float(f"{1 / measured:.{digits}g}")] * or_rate
         return next((value for value in rounded if abs(value - measured) <= unsure), rounded[-1])
     try:
         declared = float(text)
