@@ -318,7 +318,10 @@ def index_of(
 def _is_header(line: str, row: str, separator: str) -> bool:
     names, values = (cells_of(text.rstrip(f"{separator} \t"), separator) for text in (line, row))
     is_number = any(_CELL.fullmatch(name) for name in names)
-    return len(names) == len(values) and len({*names} - {""}) > 1 and not is_number
+    # A table in prose has lines that begin with a number, and words beside it.
+    n_numbers = sum(bool(_CELL.fullmatch(cell) or _DATE.match(cell)) for cell in values)
+    is_table = len(names) == len(values) and len({*names} - {""}) > 1 and n_numbers > 1
+    return is_table and not is_number
 
 
 def _separator(row: str) -> str:
