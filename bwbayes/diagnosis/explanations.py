@@ -293,8 +293,6 @@ ADDITIONS: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     growing_noise,
 )
 CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
-    operator,
-    history,
     LONG_DELAY.explanations,
     *(defect.explanations for defect in SLOW),
     exponent,
@@ -303,6 +301,9 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     dynamics,
     hold,
     smooth,
+    # Other operators take the longest: if the time is over, all stages have been fitted.
+    operator,
+    history,
 )
 
 # On a good record a ratio of evidences exceeds k with a probability of at most 1/k (Markov's

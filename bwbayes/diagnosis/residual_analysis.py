@@ -41,6 +41,12 @@ from bwbayes.watching import Watch, unwatched
 # model shows in fewer.
 READINGS = 4_000
 
+# A smaller gain in log density, nats, does not pay for any parameter.
+GAIN = 1.0
+
+# Normal scores at which new parameters may leave a fit as it is.
+SCORES = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
+
 # Number of paths from which the error of a noisy voltage's path is estimated.
 PATHS = 4
 
@@ -404,14 +410,35 @@ class ResidualAnalysis:
     def extended(self, posterior: Posterior, places: FloatArray) -> LocalFit:
         """Fit another model from places of its own.
 
-        The climb goes on while the model may become more probable than the fit by a nat: a smaller
-        gain does not pay for any parameter.
+        The climb goes on while the model may become more probable than the fit by :data:`GAIN`.
         """
-        return climb(posterior, places, self.fit.log_density + 1.0, self.watch)
+        return climb(posterior, places, self.fit.log_density + GAIN, self.watch)
 
     def local_minima(self, posterior: Posterior, starts: int = map_estimate.STARTS) -> FloatArray:
         """Find coordinates (places, free) near the modes of another model, as of that name."""
         return map_estimate.local_minima(posterior, self.generator, starts, self.watch)
+
+    def _placed(
+        self, posterior: Posterior, places: FloatArray, starts: Sequence[Mapping[str, float]]
+    ) -> FloatArray:
+        """Return places of this model in another one: new parameters start at 0, or as given."""
+        values = [
+            {**dict(zip(self.posterior.names, place, strict=True)), **start}
+            for place, start in product(places, starts)
+        ]
+        return np.array([[value.get(name, 0.0) for name in posterior.names] for value in values])
+
+    def _embedded(self, posterior: Posterior) -> FloatArray:
+        """Return the place (1, free) of another model that changes this fit least.
+
+        All new parameters are at one of a few normal scores: where they change nothing depends on
+        the parameters.
+        """
+        new = {*posterior.names} - {*self.posterior.names}
+        starts = [dict.fromkeys(new, score) for score in SCORES]
+        places = self._placed(posterior, self.places, starts)
+        best = int(np.argmax(posterior.log_density(places)))
+        return places[best : best + 1]
 
     def changed(
         self,
@@ -434,11 +461,15 @@ class ResidualAnalysis:
         posterior = self.rebuilt(self.study.with_model(spec, stated))
         compared = self.on_readings_of(posterior)
         before = self.places if sighting.places is None else sighting.places
-        places = []
-        for coordinates, start in product(before, sighting.starts):
-            values = {**dict(zip(self.posterior.names, coordinates, strict=True)), **start}
-            places.append([values.get(name, 0.0) for name in posterior.names])
-        fit = compared.extended(posterior, np.array(places))
+        places = [self._placed(posterior, before, sighting.starts)]
+        embedded = self._embedded(posterior)
+        if posterior.log_density(embedded) > np.max(posterior.log_density(places[0])) + GAIN:
+            places.append(embedded)
+        if len(sighting.starts) > 1 and self.unexplained > GAIN:
+            # No short climb leads from a fit that has taken up the effect to one that leaves it to
+            # a stage which acts for some values alone; least squares does.
+            places.append(self.local_minima(posterior, 1))
+        fit = compared.extended(posterior, np.concatenate(places))
         if not fit.follows:
             return
         text, advice = words or kind, ""

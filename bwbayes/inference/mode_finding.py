@@ -30,7 +30,7 @@ from bwbayes.watching import Watch, unwatched, watched
 GAIN, ROUNDS = 0.05, 20
 
 # Rounds from every start, and how many times what a round gained all later ones may gain.
-FIRST_ROUNDS, AHEAD = 2, 10.0
+FIRST_ROUNDS, AHEAD = 2, 20.0
 
 # Step of first derivatives, in prior sds.
 STEP = 1e-4
