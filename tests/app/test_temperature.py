@@ -19,7 +19,7 @@ from bwbayes.app.config.config import load, parse
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run
 from bwbayes.app.jobs.predict import planned_noise
-from bwbayes.app.running.explaining import search_stages
+from bwbayes.app.running.explaining import choose_model
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.study.resolve import resolve_config
@@ -126,7 +126,7 @@ def test_a_search_finds_both_coefficients() -> None:
     """Where the temperature comes back: one that only rises is a drift of the gain as well."""
     record = measured(15.0, 30.0, 5, back=True)
     config, records = config_of(record, {"dynamics": "none", "from_rest": True})
-    chosen = search_stages(resolve_config(config, Path(), records))
+    chosen = choose_model(resolve_config(config, Path(), records))
     assert chosen.run.config.model.stages == ["temperature-width", "temperature"]
 
 
@@ -276,7 +276,7 @@ def test_self_heating_is_found_and_carried_to_another_drive() -> None:
     record = heated([2, 0.3, 1, 2, 0.2, 1.5, 0.3], 21)
     config, records = config_of(record, {"dynamics": "none", "from_rest": True})
     problem = resolve_config(config, Path(), records)
-    chosen, rng = search_stages(problem), np.random.default_rng(3)
+    chosen, rng = choose_model(problem), np.random.default_rng(3)
     assert chosen.run.config.model.stages == ["heating"]
     other, found = heated([0.2, 2, 2, 0.3, 2], 22), []
     without = problem.study.posterior, map_estimate.fit(problem.study.posterior, rng)

@@ -5,8 +5,8 @@ mode of the rough one, and taken if its evidence leads by odds of twenty to one:
 discrepancy claims least, because it has white noise as a limit, and corners that a smooth one has
 not. The rough one's innovations, which are cheap to compute, show what another noise could gain.
 
-:func:`search_stages` gives a model the stages for which its record has evidence. None is added
-while the fit follows what the actuator did not do: no stage mends a transient.
+:func:`choose_model` gives a model the noise and the stages for which its record has evidence. None
+is added while the fit follows what the actuator did not do: no stage mends a transient.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ from bwbayes.watching import Watch, WatchSteps, part, parts, unwatched
 # of the sensor.
 MAX_STAGES = 3
 MAX_DISCREPANCY = 0.25
+
+# Noises of the sensor alone, beside any discrepancy.
+SENSOR_NOISES = ("student", "paced")
 
 
 def explain_record(
@@ -90,7 +93,7 @@ def chosen_noise(study: Study, point: MAPEstimate, watch: Watch = unwatched) -> 
     chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
     # That outliers spoil a record, or speed does, is an explanation, which has its own evidence.
-    candidates = {*evidence, "student", "paced"}
+    candidates = {*evidence, *SENSOR_NOISES}
     others = [n for n in NOISES if n not in candidates and (n == "white" or p < colored)]
     for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
         spec = replace(study.spec, noise=_beside(noise, sensor))
@@ -153,57 +156,36 @@ class ChosenModel(NamedTuple):
 
 
 def choose_model(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
-    """Choose what a run's config leaves open: further stages first, then the noise.
+    """Choose what a run's config leaves open: its noise, and all the stages that pay.
 
-    A config that names both is left as it is. ``watch`` is called with the name of a step and the
-    share of it that is done.
-    """
-    searched = search_stages(run, watch)
-    if run.config.model.noise != "auto":
-        return searched
-    run, point, explanations = searched.run, searched.point, searched.explanations
-    noise, why = chosen_noise(run.study, point, partial(watch, "noise model"))
-    chosen = with_model(run, replace(run.study.spec, noise=noise), noise=noise)
-    if chosen.study is not run.study:
-        # A long record's noise has further modes, and its beginning may show one that is not the
-        # best: here is the one that the noise was chosen for.
-        places = _optima_by_name(run.study.posterior, point, chosen.study.posterior)
-        step = partial(watch, f"MAP estimate, {noise} noise")
-        point = _fit_point(chosen.study, step, places)
-        explanations = None
-    return ChosenModel(chosen, point, (*searched.steps, why), explanations)
+    Each round fits the model, chooses the noise for it, explains its readings better in every way
+    there is, and takes the stage that leads; then it leaves out again what was added and is not
+    needed any more. So noise and stages cannot keep each other from being found, and the search
+    ends with a model that no stage would explain better. No stage is added with which the error on
+    readings that were held out grows by a tenth, whatever its evidence. Several records have none
+    added: an explanation is one of a single record. Time is CPU time without that of compiling, so
+    that a busy or a new machine finds the same. A search that adds three stages and leaves a model
+    error all the same has not found the mechanism: the config says so (``unexplained``), and the
+    run is inconclusive. With fewer, the error may be a disturbance, and that is a remark.
 
-
-def _fit_point(study: Study, watch: Watch, further: Iterable[FloatArray] = ()) -> MAPEstimate:
-    return map_estimate.fit(study.posterior, study.generator("point fit"), watch, further)
-
-
-def search_stages(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
-    """Give a run whose ``stages`` are ``auto`` all the stages that pay.
-
-    Each round fits the model, explains its readings better in every way there is, and takes the
-    stage that leads; then it leaves out again what was added and is not needed any more. No stage
-    is added with which the error on readings that were held out grows by a tenth, whatever its
-    evidence. Several records have none added: an explanation is one of a single record. Time is CPU
-    time without that of compiling, so that a busy or a new machine finds the same. A search that
-    adds three stages and leaves a model error all the same has not found the mechanism: the config
-    says so (``unexplained``), and the run is inconclusive. With fewer, the error may be a
-    disturbance, and that is a remark.
+    A config that names stages or noise keeps them. ``watch`` is called with the name of a step and
+    the share of it that is done.
     """
     with stopwatch(run.study.engine) as clock:
         return _search(run, clock, watch)
 
 
-def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenModel:
-    """Search as :func:`search_stages`; ``clock`` tells the time, s, since the search began."""
-    seconds = run.config.model.search_seconds
-    point = _fit_point(run.study, partial(watch, "MAP estimate"))
+def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenModel:
+    """Search as :func:`choose_model`; ``clock`` tells the time, s, since the search began."""
+    seconds = open_run.config.model.search_seconds
+    is_open = open_run.config.model.noise == "auto"
+    run, point, why = _fitted(open_run, is_open, watch)
     if not seconds or len(run.study.records) > 1:
-        return ChosenModel(run, point, (), None)
+        return ChosenModel(run, point, why, None)
     (name,) = run.study.records
     notes, steps = dict[str, str](), list[str]()
-    ties = dict[str, tuple[ModelSpec, list[ModelSpec]]]()
-    while True:
+    ties, is_over = dict[str, tuple[ModelSpec, list[ModelSpec]]](), False
+    while not is_over:
         step = partial(watch, f"stages, round {len(steps) + 1}")
         scene = _scene(run.study, name, point.optima)
         explanations = explain(scene, step, lambda: clock() > seconds)
@@ -211,7 +193,12 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
         # The last one has just been weighed.
         before = [] if is_over else [*notes][:-1]
         needless = [removal for removal in without(scene, before) if removal.nats >= 0]
-        models = [cause for cause in explanations if cause.spec is not None]
+        # So has another discrepancy, if the noise is open.
+        models = [
+            cause
+            for cause in explanations
+            if cause.spec and not (is_open and _reopened(cause.spec) == open_run.study.spec)
+        ]
         parts = likely_causes([cause for cause in models if not cause.misleads])
         if needless:
             chosen = max(needless, key=lambda removal: removal.nats)
@@ -219,9 +206,10 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
             note = f"left out again: {chosen.kind}"
         elif parts and all(cause.spec is not None for cause in followed_causes(explanations)):
             # A tie goes to a stage before another hold, then to the fewest parameters.
-            chosen, chain = min(parts, key=partial(_size, run.study)), run.study.spec.chain
+            chosen = min(parts, key=partial(_size, run.study))
             assert chosen.spec is not None
-            added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
+            new = [stage for stage in chosen.spec.chain if stage not in run.study.spec.chain]
+            added = (*new, chosen.kind)[0]
             gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
             notes[added], note = f"stage added: {gain}", f"added: {gain}"
             others = [cause.spec for cause in parts if cause.spec and cause is not chosen]
@@ -230,19 +218,15 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
             break
         steps.append(f"{note}, {clock():.0f} s")
         assert chosen.spec is not None
-        run = with_model(run, chosen.spec, chosen.stated)
-        point = _fit_point(run.study, partial(watch, "MAP estimate"))
-        if is_over:
-            break
-    for refused in likely_causes(models):
-        if refused.misleads:
-            steps.append(f"not added: {refused.text} ({refused.worth})")
-    remarks, unexplained = [*notes.values()], None
-    if is_over:
-        ended = f"the search for stages ended after {seconds:g} s, before it was complete"
-        steps.append(ended)
-        remarks.append(ended)
-    discrepancy = _relative_discrepancy(run.study.posterior, point)
+        spec = _reopened(chosen.spec) if is_open else chosen.spec
+        open_run = with_model(open_run, spec, chosen.stated)
+        run, point, why = _fitted(open_run, is_open, watch)
+    refused = [cause for cause in likely_causes(models) if cause.misleads]
+    steps += [f"not added: {cause.text} ({cause.worth})" for cause in refused]
+    ended = [f"the search for stages ended after {seconds:g} s, before it was complete"] * is_over
+    steps += ended
+    remarks = [*notes.values(), *ended]
+    unexplained, discrepancy = None, _relative_discrepancy(run.study.posterior, point)
     if len(notes) >= MAX_STAGES and discrepancy > MAX_DISCREPANCY:
         unexplained = float(f"{discrepancy:.2g}")
     elif len(notes) > MAX_STAGES or (notes and discrepancy > MAX_DISCREPANCY):
@@ -260,7 +244,33 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
         unexplained=unexplained,
         tied=[spec.changes_to(other) for other in _tied(spec, ties.values())],
     )
-    return ChosenModel(run, point, tuple(steps), None if is_over else {name: explanations})
+    return ChosenModel(run, point, (*steps, *why), None if is_over else {name: explanations})
+
+
+def _fitted(run: Run, is_open: bool, watch: WatchSteps) -> tuple[Run, MAPEstimate, tuple[str, ...]]:
+    """Fit a run, with the noise that it has evidence for if that is open, and say why it has it."""
+    point = _fit_point(run.study, partial(watch, "MAP estimate"))
+    if not is_open:
+        return run, point, ()
+    noise, why = chosen_noise(run.study, point, partial(watch, "noise model"))
+    chosen = with_model(run, replace(run.study.spec, noise=noise), noise=noise)
+    if chosen.study is not run.study:
+        # A long record's noise has further modes, and its beginning may show one that is not the
+        # best: here is the one that the noise was chosen for.
+        places = _optima_by_name(run.study.posterior, point, chosen.study.posterior)
+        step = partial(watch, f"MAP estimate, {noise} noise")
+        point = _fit_point(chosen.study, step, places)
+    return chosen, point, (why,)
+
+
+def _fit_point(study: Study, watch: Watch, further: Iterable[FloatArray] = ()) -> MAPEstimate:
+    return map_estimate.fit(study.posterior, study.generator("point fit"), watch, further)
+
+
+def _reopened(spec: ModelSpec) -> ModelSpec:
+    """Return a model with the rough discrepancy beside what is known of its sensor's noise."""
+    sensor = [noise for noise in spec.noise.split(" + ") if noise in SENSOR_NOISES]
+    return replace(spec, noise=_beside("discrepancy", sensor))
 
 
 def _tied(
