@@ -116,6 +116,9 @@ CLAIMS: dict[str, Quoted] = {
     "... not converged in their budget, at most": Quoted(
         ["max calibrated part, */unconverged"], PARTS_BESIDE
     ),
+    "95% intervals cover where the scales of sensor and monitor are drawn too, %": Quoted(
+        ["extent 100 uncertain scales/cover/*"], ["uncertain scales/records"]
+    ),
     "Joint fit of loops and steps: 95% intervals of eight parameters cover, of 40": Quoted(
         [f"extent {STUDIES[JOINT]['seeds']} {JOINT}/covered/*"], [f"{JOINT}/seeds"]
     ),
