@@ -116,6 +116,9 @@ CLAIMS: dict[str, Quoted] = {
     "... not converged in their budget, at most": Quoted(
         ["max calibrated part, */unconverged"], PARTS_BESIDE
     ),
+    "... 300 readings: 95% intervals of each quantity cover, %": Quoted(
+        ["extent 100 calibrated run/cover/*"], ["calibrated run/replicates"]
+    ),
     "95% intervals cover where the scales of sensor and monitor are drawn too, %": Quoted(
         ["extent 100 uncertain scales/cover/*"], ["uncertain scales/records"]
     ),
