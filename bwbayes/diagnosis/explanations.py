@@ -151,9 +151,10 @@ def _histories(scene: ResidualAnalysis, spec: ModelSpec) -> list[ModelSpec]:
     a drive over all voltages. The misfit of that half period spoils the fit of all others.
     """
     record = scene.posterior.single_record
-    operator = HYSTERESIS[spec.operator.name]
-    known = record.from_rest or spec.history != "unknown"
-    if known or not (isinstance(operator, type) and issubclass(operator, RemembersExtrema)):
+    if record.from_rest or spec.history != "unknown":
+        return [spec]
+    posterior = scene.rebuilt(scene.study.with_model(spec))
+    if not isinstance(posterior.single_record.actuator.hysteresis, RemembersExtrema):
         return [spec]
     return [spec, replace(spec, history="demagnetized")]
 

@@ -32,6 +32,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import normal
+from bwbayes.model.operators.prandtl_ishlinskii import PrandtlIshlinskii
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, FINE, RATE, Plant, drawn, hysteresis, lagged, plant
 from tests.prediction.runs import covered, judge, study_of
@@ -448,11 +449,22 @@ def analysis_of_plays(path: Path, hysteresis: str, *, loaded: bool) -> ResidualA
     return ResidualAnalysis.of(study.posterior, point.optima, rng, study)
 
 
-@pytest.mark.parametrize("loaded", [True, False])
+class PlaysFromOutside(PrandtlIshlinskii):
+    """An operator that goes by its import path."""
+
+
+@pytest.mark.parametrize(
+    ("hysteresis", "loaded"),
+    [
+        ("prandtl-ishlinskii", True),
+        ("prandtl-ishlinskii", False),
+        (f"{__name__}:PlaysFromOutside", True),
+    ],
+)
 def test_plays_that_a_first_load_has_moved_are_told_from_plays_that_ran(
-    tmp_path: Path, *, loaded: bool
+    hysteresis: str, tmp_path: Path, *, loaded: bool
 ) -> None:
-    analysis = analysis_of_plays(tmp_path, "prandtl-ishlinskii", loaded=loaded)
+    analysis = analysis_of_plays(tmp_path, hysteresis, loaded=loaded)
     (history,) = explanations.history(analysis)
     assert (history.nats > 100) if loaded else (history.nats < 0)
     # The fix, once it is taken, is the whole cure.
