@@ -5,7 +5,8 @@ removed; lint, types and browser stay out, since they are the same everywhere::
 
     python3.12 -m venv .oldest && python3 -m tests.oldest > .oldest/oldest.txt
     .oldest/bin/pip install . pytest pytest-xdist hypothesis pyyaml -c .oldest/oldest.txt
-    .oldest/bin/pip install nbclient nbformat ipykernel 'distributed==2024.12' -c .oldest/oldest.txt
+    .oldest/bin/pip install nbclient nbformat ipykernel 'distributed==2024.12' 'npTDMS==1.9' \
+        'openpyxl==3.1' -c .oldest/oldest.txt
     .oldest/bin/python -m pytest -n 2 -W default --ignore tests/test_style.py \
         --ignore tests/test_packaging.py
 
