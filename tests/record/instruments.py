@@ -269,6 +269,12 @@ _text(
     (named("CH1", "CH2"), MICRONS),
 )
 _text(
+    "Rigol, settings in the header of lines that end with a separator",
+    ["X,CH1,CH2,Start,Increment,", f"Sequence,Volt,Volt,0.000000e+00,{INTERVAL:e}"],
+    [f"{i},{row}" for i, row in enumerate(_rows(COLUMNS[1:], ",", end=","))],
+    (named("CH1", "CH2"), MICRONS),
+)
+_text(
     "Rigol, increment behind the names",
     [f"CH1(V),CH2(V),t0 = 0.000000e+00s, tInc = {INTERVAL:e}s,"],
     _rows(COLUMNS[1:], ",", end=",,"),

@@ -220,7 +220,7 @@ def split_header(line: str, layout: Layout) -> list[str]:
     for number, fields in enumerate(ways):
         cells = [cell.strip().strip('"').rstrip(",") for cell in fields]
         more = any(cells[layout.fields :]) and (number > 0 or layout.separator == " ")
-        filled = [cell for i, cell in enumerate(cells) if i not in layout.empty]
+        filled = [c for i, c in enumerate(cells[: layout.fields]) if i not in layout.empty]
         # A rule of dashes, as below the names of tables that are drawn, is none.
         is_name = any(re.search(r"\w", cell) for cell in filled)
         is_name &= not any(_NUMBER.fullmatch(cell) or _DATE.match(cell) for cell in filled)
