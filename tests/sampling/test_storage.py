@@ -117,6 +117,7 @@ DAMAGES: dict[str, Callable[[bytes, np.random.Generator], bytes]] = {
 }
 
 
+@pytest.mark.filterwarnings("error::bwbayes.InputWarning")  # whatever the others are
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_what_comes_before_a_damage_is_used_and_resuming_makes_the_rest_again(
     whole: Path, tmp_path: Path, kind: str
