@@ -202,7 +202,7 @@ def test_numbers_table_and_picture_agree(
     assert (folder / "track.png").read_bytes().startswith(b"\x89PNG")
     page = (folder / "track.html").read_text(encoding="utf-8")
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
-    assert f"{numbers['table'][0]['rms_um']:.2f}</td>" in page
+    assert f"{numbers['table'][0]['rms_um']:.3g}</td>" in page
     least = min(best["share"] for best in numbers["best_share"])
     share = "all" if least == 1 else f"at least {100 * least:.0f}% of the"
     assert f"in {share} draws, on every signal" in page
