@@ -507,7 +507,7 @@ def _write(folder: Path, name: str, arrays: Arrays) -> None:
     draft = folder / f"{name}.partial"
     try:
         with draft.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            np.savez(file, **arrays)
         draft.replace(folder / f"{name}.npz")
     except OSError as error:
         draft.unlink(missing_ok=True)

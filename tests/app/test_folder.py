@@ -397,7 +397,7 @@ def test_chain_without_a_fingerprint_is_refused(copy: RunFolder) -> None:
         arrays = dict(file)
     text = json.loads(str(arrays["text"]))
     del text["attributes"]["posterior"]
-    np.savez(copy.chain / "start.npz", allow_pickle=False, **arrays | {"text": json.dumps(text)})
+    np.savez(copy.chain / "start.npz", **arrays | {"text": json.dumps(text)})
     for use in (redraw, resumed):
         with pytest.raises(InputError, match=r"does not say which priors .* start a new run"):
             use(copy)

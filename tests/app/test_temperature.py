@@ -383,7 +383,7 @@ def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(
     old = json.loads(noted["attributes"]["posterior"])
     del old["voltage of record"]
     noted["attributes"]["posterior"] = json.dumps(old)
-    np.savez(kept.chain / "start.npz", allow_pickle=False, **arrays | {"text": json.dumps(noted)})
+    np.savez(kept.chain / "start.npz", **arrays | {"text": json.dumps(noted)})
     with pytest.raises(InputError, match=r"voltage of record was .* start a new run"):
         resume(kept, small.quiet(), workers=1)
 

@@ -112,7 +112,7 @@ def save(path: Path, state: str, values: Mapping[str, object]) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps({"state": state, "values": _text_of(values, arrays)})
     content = BytesIO()
-    np.savez(content, allow_pickle=False, text=np.array(text), **arrays)
+    np.savez(content, text=np.array(text), **arrays)
     with draft_of(path) as draft:
         draft.write_bytes(sha256(content.getvalue()).digest() + content.getvalue())
 
