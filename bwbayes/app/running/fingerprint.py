@@ -111,8 +111,8 @@ def save(path: Path, state: str, values: Mapping[str, object]) -> None:
     """Write what was worked out of a run in that state."""
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps({"state": state, "values": _text_of(values, arrays)})
-    content = BytesIO()
-    np.savez(content, text=np.array(text), **arrays)
+    content, members = BytesIO(), dict[str, Any](text=np.array(text), **arrays)
+    np.savez(content, **members)
     with draft_of(path) as draft:
         draft.write_bytes(sha256(content.getvalue()).digest() + content.getvalue())
 
