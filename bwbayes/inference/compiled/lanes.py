@@ -71,10 +71,15 @@ def compile_time() -> Iterator[CompileTime]:
 
 
 class CompileTime(Listener):
-    """The process's CPU time, in ``seconds``, of what numba has compiled while it listens."""
+    """The process's CPU time of what numba has compiled while it listens."""
 
     def __init__(self) -> None:
-        self.seconds, self._depth, self._begin = 0.0, 0, 0.0
+        self._ended, self._depth, self._begin = 0.0, 0, 0.0
+
+    @property
+    def seconds(self) -> float:
+        """The time so far, that of a compilation that goes on included."""
+        return self._ended + (time.process_time() - self._begin if self._depth else 0.0)
 
     def on_start(self, event: Event) -> None:  # noqa: ARG002
         """Compilation begins; that of a function includes those that it calls."""
@@ -86,7 +91,7 @@ class CompileTime(Listener):
         """Compilation ends."""
         self._depth -= 1
         if self._depth == 0:
-            self.seconds += time.process_time() - self._begin
+            self._ended += time.process_time() - self._begin
 
 
 def inner(**options: Any) -> Any:
