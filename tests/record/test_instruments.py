@@ -333,6 +333,7 @@ FORMATS = {
 )
 @example("duration", 0.25, 0.99999, False)  # beyond a day
 @example("date", 1e-5, 0.0, True)
+@example("date", 2e-5, 0.45039, True)
 def test_times_are_as_fine_as_their_numbers_however_they_are_shown(
     folder: Path, shown: str, dt: float, start: float, by_python: bool
 ) -> None:

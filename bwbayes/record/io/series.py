@@ -229,7 +229,10 @@ def in_seconds(times: Any) -> NDArray[Any]:
     if values.dtype.kind not in "mM":
         return values
     zero = np.datetime64(0, "ns") if values.dtype.kind == "M" else np.timedelta64(0, "ns")
-    return np.asarray((values - zero) / np.timedelta64(1, "ns") / 1e9)
+    # Round only once: a date in ns has more digits than a double.
+    with np.errstate(invalid="ignore"):  # of a missing date, which becomes nan
+        seconds, rest = np.divmod(values - zero, np.timedelta64(1, "s"))
+    return np.asarray(seconds + rest / np.timedelta64(1, "s"))
 
 
 def damaged(where: object, error: Exception) -> InputError:
