@@ -145,9 +145,15 @@ class Stage(ABC):
     ) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models, samples) of values, and the memory after them.
 
-        All models take one sample together. The arguments are not changed. ``seen`` is what
-        the stage sees, (columns, samples); by default as ``numbers`` have it.
+        All models take one sample together; a stage without memory takes all samples, too. The
+        arguments are not changed. ``seen`` is what the stage sees, (columns, samples); by default
+        as ``numbers`` have it.
         """
+        if not self.remembers:
+            known = [*numbers.T[..., np.newaxis]]
+            if seen is not None:
+                known[len(known) - len(seen) :] = seen
+            return np.asarray(self.move(known, memory.T, values, memory.T)), memory
         result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
         for sample in range(values.shape[1]):

@@ -17,7 +17,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, whitening
 from bwbayes.inference.compiled.filter import PAIR, FilterState, Transition
 from bwbayes.inference.compiled.kernels import RecordArrays, Unknowns
-from bwbayes.inference.compiled.lanes import apart
+from bwbayes.inference.compiled.lanes import apart, read_only
 from bwbayes.inference.compiled.motion import Motion, Shared, physics, simulated
 from bwbayes.inference.compiled.stages import CompiledDrive, Given, advance_of, prepared
 from bwbayes.inference.likelihood import Likelihood, batches
@@ -57,7 +57,7 @@ def products(
     # are few, a pass over all samples takes longer than whitening the readings.
     if noise.states > 2 or (is_known and 2 * readings.rows.size < readings.samples):
         return likelihood.products_of_series(theta, np.empty((0, readings.rows.size)), displacement)
-    record = RecordArrays(likelihood.inputs_read.voltage, likelihood.values, gaps)
+    record = RecordArrays(read_only(likelihood.inputs_read.voltage), likelihood.values, gaps)
     column = likelihood.table.columns(theta)
     sections, series = actuator.sections(column), 1 + likelihood.unknowns
     steps, filtering = _filtering(noise, likelihood.table.noise(theta), readings.gaps[0])

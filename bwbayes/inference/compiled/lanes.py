@@ -94,6 +94,13 @@ class CompileTime(Listener):
             self._ended += time.process_time() - self._begin
 
 
+def read_only(values: FloatArray) -> FloatArray:
+    """Return a read-only view; numba compiles functions anew for arrays that may be written."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
+
+
 def inner(**options: Any) -> Any:
     """Compile a function that only compiled functions call, without the wrappers for Python."""
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled.lanes import LANES, Structs, compile_cached, inner
+from bwbayes.inference.compiled.lanes import LANES, Structs, compile_cached, inner, read_only
 from bwbayes.inference.compiled.motion import PIECE, Motion, Shared, displace, physics
 from bwbayes.inference.compiled.stages import (
     CompiledDrive,
@@ -100,8 +100,6 @@ def _walk_core(
     if crept:
         named |= {"lag": np.concatenate(crept, axis=1)}
     motions, now = Motion.filled(named), 0
-    # A read-only view, so that numba compiles only one signature.
-    read_only = np.broadcast_to(voltage, voltage.shape)
     shared = Shared.of(actuator, voltage)
 
     def onwards(last: int) -> FloatArray:
@@ -111,7 +109,7 @@ def _walk_core(
         if isinstance(models, Given):
             drive, memory = advance(window, memory)
             models = models._replace(drive=np.ascontiguousarray(drive), begin=now)
-        _walk(source.owner, models, shared, motions, read_only, now, displacement)
+        _walk(source.owner, models, shared, motions, read_only(voltage), now, displacement)
         now = last
         return displacement
 
@@ -189,11 +187,12 @@ def _advance_stage(
     seen: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the result of :meth:`~bwbayes.model.stage.Stage.advance`."""
-    if type(stage).advance is not Stage.advance:
+    if type(stage).advance is not Stage.advance or not stage.remembers:
         return stage.advance(numbers, memory, values, seen)  # takes all samples at once
     result, after = np.empty(values.shape), memory.copy()
     seen = np.empty((0, 0)) if seen is None else seen.copy()  # numba compiles for this type alone
-    _pass(stage, numbers.copy("C"), after, np.ascontiguousarray(values), seen, result)
+    values = read_only(np.ascontiguousarray(values))
+    _pass(stage, numbers.copy("C"), after, values, seen, result)
     return result, after
 
 
@@ -208,7 +207,8 @@ def _drive_of_own(
     if isinstance(step, RelaxingStep):
         # Add the row that tells its lanes whether any model is curved or depends on a sign.
         numbers = np.column_stack([numbers, np.full(len(numbers), step.curved or step.signed)])
-    _pass(step, numbers, after, np.ascontiguousarray(voltage), np.empty((0, 0)), drive)
+    voltage = read_only(np.ascontiguousarray(voltage))
+    _pass(step, numbers, after, voltage, np.empty((0, 0)), drive)
     return drive, after
 
 
