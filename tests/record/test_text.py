@@ -65,6 +65,9 @@ HARMLESS = {
     "order": lines(*(",".join(line.split(",")[::-1]) for line in LINES)).encode(),
     "comments": ("# anything\n# at all: yes\n\n" + GOOD).encode(),
     "comments below": (GOOD + "\n% 30 samples\n# end").encode(),
+    "Markdown": lines(
+        *(f"| {line.replace(',', ' | ')} |" for line in (HEADER, "---,---:,:---:", *ROWS))
+    ).encode(),
     "french": GOOD.replace(HEADER, "Temps (s),Tension (V),Déplacement (µm)").encode("cp1252"),
 }
 
@@ -446,6 +449,60 @@ def test_empty_columns_are_none(
     record = read(folder, text)
     good = read(folder, GOOD)
     assert record.sha256 == good.sha256
+
+
+@quiet
+@given(
+    separator=st.sampled_from([";", "\t", "|", ","]),
+    scales=st.tuples(
+        *(
+            st.sampled_from([*u.items()])
+            for u in (
+                {"s": 1.0, "ms": 1e3},
+                {"V": 1.0, "mV": 1e3},
+                {"um": 1.0, "\u00b5m": 1.0, "nm": 1e3},
+            )
+        )
+    ),
+    blank=st.sampled_from(["", " "]),
+    quote=st.sampled_from(["", '"']),
+    comma=st.booleans(),
+    missing=st.sets(st.integers(0, 28), max_size=3),
+)
+def test_each_number_may_have_its_unit_behind_it(
+    folder: Path,
+    separator: str,
+    scales: tuple[tuple[str, float], ...],
+    blank: str,
+    quote: str,
+    comma: bool,
+    missing: set[int],
+) -> None:
+    """Whatever separates them, with decimal points or commas, and where readings are missing."""
+    rows = []
+    for number, row in enumerate(ROWS):
+        cells = [
+            f"{float(cell) * scale:.7f}{blank}{unit}"
+            for cell, (unit, scale) in zip(row.split(","), scales, strict=True)
+        ]
+        cells[2] = "" if number in missing else cells[2]
+        cells = [cell.replace(".", ",") for cell in cells] if comma else cells
+        mark = '"' if comma and separator == "," else quote
+        rows.append(separator.join(f"{mark}{cell}{mark}" for cell in cells))
+    record = read(folder, lines("time,voltage,displacement".replace(",", separator), *rows))
+    good = read(folder, GOOD)
+    assert record.interval == good.interval
+    np.testing.assert_allclose(record.voltage, good.voltage, rtol=1e-12)
+    expected = np.array(good.displacement)
+    expected[[*missing]] = np.nan
+    np.testing.assert_allclose(record.displacement, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("other", ["10 ms", "0.010 V", "0.010"])
+def test_a_unit_that_changes_in_a_column_is_none(tmp_path: Path, other: str) -> None:
+    rows = [row.replace(",", " s,", 1) for row in ROWS]
+    text = lines(HEADER, *rows[:2], f"{other},1,1", *rows[3:])
+    assert "not a number" in fault(tmp_path, text)
 
 
 def test_columns_of_other_quantities_are_ignored_with_a_remark(tmp_path: Path) -> None:

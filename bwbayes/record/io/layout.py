@@ -59,6 +59,50 @@ def cells_of(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
 
 
+def without_frame(lines: Sequence[str]) -> list[str]:
+    """Return the lines of a table in Markdown without the bars at either end; others as they are.
+
+    The rule below its header shows that it is one.
+    """
+    if not any(re.fullmatch(r"\|[\s:|]*-[\s:|-]*\|\s*", line) for line in lines):
+        return [*lines]
+    return [re.sub(r"^\|(.*)\|\s*$", r"\1", line) for line in lines]
+
+
+_WITH_UNIT = re.compile(r"([+-]?[\d.,]*\d(?:[eE][+-]?\d+)?) ?([^\W\d_]*)|")
+
+
+def without_units(lines: Sequence[str]) -> list[str]:
+    """Move the unit behind each number of a column, as in ``1.5 V``, to the column's name.
+
+    Lines without names, or with different units in a column, stay as they are.
+    """
+    split = {mark: cells_of(lines[-1], mark) for mark in SEPARATORS[:-1] if mark in lines[-1]}
+    ways = [mark for mark, cells in split.items() if all(map(_WITH_UNIT.fullmatch, cells))]
+    if not ways or not any(_WITH_UNIT.sub(r"\2", cell) for cell in split[ways[0]]):
+        return [*lines]
+    separator, last = ways[0], split[ways[0]]
+    cells = [[_WITH_UNIT.fullmatch(cell) for cell in cells_of(line, separator)] for line in lines]
+    rows = {i: row for i, row in enumerate(cells) if len(row) == len(last) and all(row)}
+    first = min(rows, default=0)
+    names = cells_of(lines[first - 1], separator) if first else []
+    columns = zip(*rows.values(), strict=True)
+    units = [{cell[2] for cell in column if cell and cell[0]} for column in columns]
+    if len(names) != len(last) or any(len(of_column) != 1 for of_column in units):
+        return [*lines]
+    moved = [*lines]
+    named = [
+        f"{name} ({unit})" if unit else name for name, (unit,) in zip(names, units, strict=True)
+    ]
+    moved[first - 1] = separator.join(named)
+    for index, row in rows.items():
+        numbers = [cell[1] or "" for cell in row if cell]
+        moved[index] = separator.join(
+            f'"{number}"' if separator in number else number for number in numbers
+        )
+    return moved
+
+
 def find_layout(path: Path, lines: Sequence[str]) -> Layout:
     """Find the layout of the numbers in a text, from the lines in its middle and at its end."""
     center, sample = len(lines) // 2, 60

@@ -47,6 +47,8 @@ from bwbayes.record.io.layout import (
     stated_above,
     tables_of,
     with_units,
+    without_frame,
+    without_units,
 )
 from bwbayes.record.io.series import Clock, Series, Source, in_seconds
 from bwbayes.record.record import Record
@@ -78,11 +80,9 @@ def text_source(
     clocks: dict[int, Clock] = {}
     if text.startswith("LabVIEW Measurement"):
         text, clocks = plain_lvm(path, text)
-    lines = text.split("\n")
-    # Lines that programs write below the numbers are no samples, and show that the last is whole.
-    while len(lines) > 1 and (not lines[-1].strip(' \t,;|"') or lines[-1].startswith(("#", "%"))):
-        lines.pop()
-        is_whole = True
+    written = without_frame(text.split("\n"))
+    lines = without_units(_without_foot(written))
+    is_whole |= len(lines) < len(written)
     if (longest := max(map(len, lines))) > csv.field_size_limit():
         raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
     tables = tables_of(lines)
@@ -224,6 +224,14 @@ def _decoded(path: Path) -> str:
         return text
     thousands = rf"(?<![\d.,])\d{{1,3}}({_OTHER_MARKS}\d{{3}})+(?!\d)"
     return re.sub(thousands, lambda number: re.sub(_OTHER_MARKS, "", number[0]), text)
+
+
+def _without_foot(lines: Sequence[str]) -> Sequence[str]:
+    """Return lines without those that programs write below the numbers, and that are no samples."""
+    last = len(lines)
+    while last > 1 and re.match(r"[#%]|[\s,;|\"]*$", lines[last - 1]):
+        last -= 1
+    return lines[:last]
 
 
 def _samples(
