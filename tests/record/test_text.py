@@ -495,7 +495,7 @@ def test_each_number_may_have_its_unit_behind_it(
     np.testing.assert_allclose(record.voltage, good.voltage, rtol=1e-12)
     expected = np.array(good.displacement)
     expected[[*missing]] = np.nan
-    np.testing.assert_allclose(record.displacement, expected, rtol=1e-12)
+    np.testing.assert_allclose(np.array(record.displacement), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("other", ["10 ms", "0.010 V", "0.010"])
