@@ -7,9 +7,9 @@ voltage acts and inverse the voltage for the next sample: forward of inverse is 
 value that is not a number holds the last voltage and sets ``held`` of the state.
 
 :func:`c_functions` prints Python functions of numbers as C, so that a controller's code is written
-once. They are made of assignments, ``if``, loops, arithmetic, functions of ``math.h``, and
-functions of the same kind. Python's own unparser writes their expressions; what C spells otherwise
-is replaced in the syntax tree first.
+once. They are made of assignments, ``if``, loops, arithmetic, those of NumPy's functions that
+``math.h`` has, and functions of the same kind. Python's own unparser writes their expressions; what
+C spells otherwise is replaced in the syntax tree first.
 """
 
 from __future__ import annotations
@@ -53,6 +53,19 @@ from bwbayes.report.report import Facts, Product, Report
 from bwbayes.report.result import refuse_existing, write_summary
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
+
+# NumPy's functions of numbers that math.h has, by their names there.
+MATH_H: Mapping[str, str] = {
+    **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{f"arc{name}": f"a{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "tan2")},
+    **{name: name for name in ("exp", "exp2", "expm1", "log", "log2", "log10", "log1p")},
+    **{name: name for name in ("sqrt", "cbrt", "hypot", "floor", "ceil", "trunc", "rint")},
+    **{name: name for name in ("fabs", "copysign", "fmod", "fmin", "fmax")},
+    "abs": "fabs",
+    "minimum": "fmin",
+    "maximum": "fmax",
+    "power": "pow",
+}
 
 
 def c_functions(
@@ -212,7 +225,10 @@ class _Printer(ast.NodeTransformer):
         """Return a variable, or the value of a module's constant."""
         if node.id in self.variables:
             return node
-        return ast.Name(to_c_number(self.function.__globals__[node.id]))
+        constant = self.function.__globals__.get(node.id)
+        if not isinstance(constant, int | float):
+            raise self.refused(node)
+        return ast.Name(to_c_number(constant))
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
         """Return an element of an array, or of a module's table."""
@@ -267,19 +283,13 @@ class _Printer(ast.NodeTransformer):
 
     def call(self, node: ast.Call, pointers: Sequence[str]) -> str:
         """Return a call of a function of math.h, or of one that is printed before this one."""
+        if node.keywords:
+            raise self.refused(node)
         texts = [self.text(x) for x in node.args if ast.unparse(x) not in self.bindings]
         arguments = ", ".join([*texts, *pointers])
         match node.func:
-            case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
-                # Functions with another name in math.h.
-                others = {
-                    "abs": "fabs",
-                    "minimum": "fmin",
-                    "maximum": "fmax",
-                    "power": "pow",
-                    "arctanh": "atanh",
-                }
-                return f"{others.get(name, name)}({arguments})"
+            case ast.Attribute(value=ast.Name(id="np"), attr=name) if name in MATH_H:
+                return f"{MATH_H[name]}({arguments})"
             case ast.Name(id=name):
                 function = self.bindings.get(name, self.function.__globals__.get(name))
                 if inspect.isfunction(function):
@@ -296,7 +306,8 @@ class _Printer(ast.NodeTransformer):
         """Return the error that names what cannot be printed."""
         return InputError(
             f"{self.function.__qualname__}: `{ast.unparse(node)}` has no counterpart in C here; "
-            "write it with arithmetic, if, for, while and NumPy's functions of a number"
+            "write it with arithmetic, if, for, while, bwbayes.arrays.select, and those of NumPy's "
+            "functions that math.h has"
         )
 
 
@@ -346,10 +357,11 @@ class Exported(Product):
         """
         numbers, code = files = [Path(folder) / name for name in FILES]
         refuse_existing(files, overwrite=overwrite)
+        printed = self.c_code()  # may be refused: then no file is written
         with refuse_unwritable(folder, "choose another folder"):
             numbers.parent.mkdir(parents=True, exist_ok=True)
             write_summary(numbers, self.quantities.rendered(self.numbers()))
-            code.write_text(self.c_code(), encoding="ascii")
+            code.write_text(printed, encoding="ascii")
         watch(1.0)
         return files
 

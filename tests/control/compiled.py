@@ -2,13 +2,15 @@
 
 import ctypes
 import subprocess
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.ctypeslib import ndpointer
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.exported import Exported
+from bwbayes.control.exported import Exported, c_functions
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 
@@ -34,6 +36,29 @@ size_t state_bytes(void) { return sizeof(actuator_state); }
 """
 
 
+def compiled_functions(
+    functions: Sequence[Callable[..., Any]],
+    shapes: Mapping[str, tuple[int, ...]],
+    folder: Path,
+    compiler: str,
+) -> ctypes.CDLL:
+    """Return Python functions as a library of C, in a folder; their names begin with ``c_``."""
+    code = c_functions(functions, shapes, "c_").replace("static double c_", "double c_")
+    (folder / "printed.c").write_text(f"#include <math.h>\n{code}", encoding="ascii")
+    run_compiler(compiler, folder, "-shared", "-fPIC", "printed.c", "-o", "printed.so", "-lm")
+    library = ctypes.CDLL(str(folder / "printed.so"))
+    for function in functions:
+        getattr(library, f"c_{function.__name__}").restype = ctypes.c_double
+    return library
+
+
+def run_compiler(compiler: str, folder: Path, *arguments: str) -> None:
+    done = subprocess.run(
+        [compiler, *STRICT, *arguments], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert (0, "") == (done.returncode, done.stderr)
+
+
 class Compiled:
     """A model in C, in a folder; ``compiler`` is its path."""
 
@@ -43,16 +68,9 @@ class Compiled:
         functions = ["forward", *(["inverse"] if made.without_inverse is None else [])]
         loops = [DRIVER.replace("FUNCTION", one) for one in functions]
         (folder / "driver.c").write_text("".join([BEGINNING, *loops]), encoding="ascii")
-        self._compile(compiler, folder, "-shared", "-fPIC", "driver.c", "-o", "actuator.so", "-lm")
+        run_compiler(compiler, folder, "-shared", "-fPIC", "driver.c", "-o", "actuator.so", "-lm")
         self._library = ctypes.CDLL(str(folder / "actuator.so"))
         self._library.state_bytes.restype = ctypes.c_size_t
-
-    @staticmethod
-    def _compile(compiler: str, folder: Path, *arguments: str) -> None:
-        done = subprocess.run(
-            [compiler, *STRICT, *arguments], cwd=folder, capture_output=True, text=True, check=False
-        )
-        assert (0, "") == (done.returncode, done.stderr)
 
     @property
     def bytes(self) -> int:

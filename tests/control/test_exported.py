@@ -5,8 +5,9 @@ What is printed as C does what the function does; what cannot be printed is refu
 
 import ctypes
 import json
-import subprocess
 from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,15 @@ from hypothesis import given, strategies as st
 from scipy.signal import StateSpace, dlsim
 
 from bwbayes.arrays import FloatArray, anywhere, look_up, select
-from bwbayes.control.exported import Exported, c_functions, exported, to_ascii
+from bwbayes.control.exported import MATH_H, Exported, c_functions, exported, to_ascii
 from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Hold, Limits
 from bwbayes.model.registry import HYSTERESIS, build_part
+from bwbayes.model.stages.sensor import ReversedSign
 from tests.control import cases
-from tests.control.compiled import STRICT, Compiled
+from tests.control.compiled import Compiled, compiled_functions
 from tests.programs import needs
 
 every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
@@ -239,10 +241,80 @@ def test_greek_and_signs_have_names() -> None:
     assert "alpha - beta^2 >= phi_1(-z)" == to_ascii("α − β² ≥ φ_1(−z)")
 
 
-@pytest.mark.parametrize("function", [swaps, divides, unknown])
+def signs(x: Any) -> Any:
+    """Call a function of NumPy that math.h does not have."""
+    return np.sign(x)
+
+
+def chooses(x: Any) -> Any:
+    """Choose by NumPy's own function, for which there is ``select``."""
+    return np.where(x > 0.0, x, 0.0)
+
+
+def writes(x: Any, after: Any) -> Any:
+    """Give an argument by its name."""
+    return np.abs(x, out=after)
+
+
+def scaled(x: Any) -> Any:
+    """Use a module's constant that is no number."""
+    return x * ROWS
+
+
+@pytest.mark.parametrize(
+    "function", [swaps, divides, unknown, signs, chooses, writes, scaled], ids=lambda f: f.__name__
+)
 def test_what_c_does_not_have_is_refused(function: Callable[..., Any]) -> None:
     with pytest.raises(InputError, match=rf"^{function.__name__}: `.*` has no counterpart in C"):
         c_functions([function], {}, "c_")
+
+
+class Signed(ReversedSign):
+    """A stage whose formula has no counterpart in C."""
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return y."""
+        return value + 0.1 * np.sign(value)
+
+
+def test_a_refused_formula_leaves_no_files(tmp_path: Path) -> None:
+    made = replace(cases.actuator("bouc-wen"), stages=(Signed(),))
+    model = exported("signed", made, cases.theta(made)[0], Limits(*cases.SPAN))
+    with pytest.raises(
+        InputError, match=r"^Signed.move: `np.sign\(value\)` has no counterpart in C here; "
+    ):
+        model.save(tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+
+
+@pytest.fixture(scope="module")
+def math_h(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ctypes.CDLL]:
+    """Return a module with each of NumPy's functions by itself, and the same in C."""
+    folder, lines = tmp_path_factory.mktemp("math_h"), ["import numpy as np"]
+    for name in MATH_H:
+        arguments = ", ".join("xy"[: getattr(np, name).nin])
+        lines += [f"def of_{name}({arguments}):", f"    return np.{name}({arguments})"]
+    (folder / "every_function.py").write_text("\n".join(lines), encoding="ascii")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        module = import_module("every_function")
+    functions = [getattr(module, f"of_{name}") for name in MATH_H]
+    return module, compiled_functions(functions, {}, folder, needs("cc"))
+
+
+@pytest.mark.parametrize("name", MATH_H)
+@given(x=st.floats(-20.0, 20.0), y=st.floats(-20.0, 20.0))
+def test_a_function_of_numpy_has_its_counterpart_in_c(
+    math_h: tuple[Any, ctypes.CDLL], name: str, x: float, y: float
+) -> None:
+    """Outside of where it is defined as well: nan is nan and infinity infinity."""
+    module, library = math_h
+    arguments = (x, y)[: getattr(np, name).nin]
+    with np.errstate(all="ignore"):
+        expected = getattr(module, f"of_{name}")(*map(np.float64, arguments))
+    got = getattr(library, f"c_of_{name}")(*map(ctypes.c_double, arguments))
+    assert got == pytest.approx(float(expected), rel=1e-14, abs=1e-300, nan_ok=True)
 
 
 @pytest.fixture(scope="module")
@@ -250,14 +322,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return ``everything`` as a function of C."""
     folder: Path = tmp_path_factory.mktemp("printed")
     shapes = {"parameters": (3,), "memory": (2,), "after": (2,)}
-    code = c_functions([everything], shapes, "c_").replace("static double c_everything", "X")
-    code = f"#include <math.h>\n{code.replace('X(', 'double c_everything(', 1)}"
-    (folder / "printed.c").write_text(code, encoding="ascii")
-    command = [needs("cc"), *STRICT, "-Wno-unused", "-shared", "-fPIC", "printed.c", "-o", "c.so"]
-    subprocess.run([*command, "-lm"], cwd=folder, check=True)
-    function = ctypes.CDLL(str(folder / "c.so")).c_everything
-    function.restype = ctypes.c_double
-    return function
+    return compiled_functions([everything], shapes, folder, needs("cc")).c_everything
 
 
 @given(x=st.floats(-50.0, 50.0))

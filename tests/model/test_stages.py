@@ -4,6 +4,7 @@ The oracles are plain loops over samples and scipy; the compiled passes, pieces 
 inverse, a model at a controller's pace and its C file have to agree with the whole record in NumPy.
 """
 
+import ctypes
 from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
@@ -38,7 +39,7 @@ from bwbayes.model.stages.amplifier_limits import Saturation
 from bwbayes.model.stages.gain import Temperature
 from bwbayes.model.stages.lags import Delay
 from bwbayes.record.teststand import RING_BENDER, true_values
-from tests.control.compiled import Compiled
+from tests.control.compiled import Compiled, compiled_functions
 from tests.programs import needs
 
 SPAN = Span(-80.0, 80.0)
@@ -360,6 +361,41 @@ def test_a_controller_and_its_c_file_do_the_same_and_undo_a_stage(
     reached = displacement[: again.size]
     error = np.abs(again - reached)[np.roll(near, int(hold == "zero"))]
     assert np.quantile(error, 0.98) < 1e-6
+
+
+@every_stage
+def test_a_stage_does_the_same_in_c(name: str, tmp_path: Path) -> None:
+    """Sample by sample: at rest, on the way and back; whatever it sees, time or a covariate."""
+    stage, x = STAGES[name](), drive(120)
+    column = {one: np.array([value]) for one, value in VALUES.items()}
+    inputs = inputs_of(x)
+    (numbers,) = stage.numbers_at(column, Timing(INTERVAL, "first"), inputs)
+    functions: dict[str, Any] = {"settle": stage.settle, "move": stage.move, "undo": stage.undo}
+    functions = {key: one for key, one in functions.items() if one is not getattr(Stage, key)}
+    size = max(stage.remembers, 1)
+    shapes = {"parameters": numbers.shape, "memory": (size,), "after": (size,)}
+    library = compiled_functions([*functions.values()], shapes, tmp_path, needs("cc"))
+
+    def compare(key: str, *arguments: Any) -> tuple[float, FloatArray]:
+        """Return what Python makes of arguments, and the memory that it leaves, as C does."""
+        after, in_c = np.zeros(size), np.zeros(size)
+        last = () if key == "undo" else (after,)
+        expected = float(functions[key](numbers, *arguments, *last))
+        given = (numbers, *arguments, in_c)[: len(arguments) + 1 + len(last)]
+        row = ctypes.POINTER(ctypes.c_double)
+        got = getattr(library, f"c_{key}")(
+            *(a.ctypes.data_as(row) if np.ndim(a) else ctypes.c_double(a) for a in given)
+        )
+        np.testing.assert_allclose([got, *in_c], [expected, *after], rtol=1e-12, atol=1e-12)
+        return expected, after
+
+    memory = compare("settle", x[0])[1] if stage.remembers else np.zeros(size)
+    for value, seen in zip(x, stage.seen(inputs).T, strict=True):
+        numbers[len(numbers) - len(seen) :] = seen
+        moved, after = compare("move", memory, value)
+        if "undo" in functions:
+            compare("undo", memory, moved)
+        memory = after
 
 
 @pytest.mark.parametrize(
