@@ -71,15 +71,16 @@ class FormulaType(types.Type):
 @typeof_impl.register(RemembersExtrema)
 def _type_of(formula: HysteresisStep | RemembersExtrema | Stage, _: Any) -> FormulaType:
     kind: Any = type(formula)
-    # Reading the sources takes longer than a short record: a class does so once.
-    if "_numba_type_" not in vars(kind):
+    # Reading the sources takes longer than a short record: a class does so once. It keeps its type
+    # by another name than numba's own, by which a subclass would be taken for its base.
+    if "_formula_type" not in vars(kind):
         files = sorted({inspect.getfile(inner) for inner in _functions(_formula_of(kind))})
         # Which knows the cells of a notebook too.
         lines = (line for file in files for line in linecache.getlines(file))
         digest = sha256("".join(lines).encode()).hexdigest()[:16]
-        kind._numba_type_ = FormulaType(f"{kind.__module__}:{kind.__qualname__}@{digest}")
-        kind._numba_type_.kind = kind
-    return cast("FormulaType", kind._numba_type_)
+        kind._formula_type = FormulaType(f"{kind.__module__}:{kind.__qualname__}@{digest}")
+        kind._formula_type.kind = kind
+    return cast("FormulaType", kind._formula_type)
 
 
 def _formula_of(kind: Any) -> Callable[..., Any]:

@@ -36,6 +36,7 @@ from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
 from bwbayes.model.stages.amplifier_limits import Saturation
+from bwbayes.model.stages.backlash import Backlash
 from bwbayes.model.stages.gain import Temperature
 from bwbayes.model.stages.lags import Delay
 from bwbayes.record.teststand import RING_BENDER, true_values
@@ -515,6 +516,28 @@ def test_a_stage_without_undo_is_refused_in_one_line_where_a_command_is_asked_fo
     assert "no command undoes" in str(
         exported("one way", made, models[0], Limits(*SPAN)).without_inverse
     )
+
+
+class Wearing(Backlash):
+    """Another formula with the same parameters."""
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:
+        """Return y."""
+        after[0], after[1] = memory[0] + 0.1 * (value - memory[0]), value
+        return after[0] * parameters[0]
+
+
+def test_a_stage_derived_from_another_is_compiled_by_itself() -> None:
+    """In a process that has compiled its base already."""
+    inputs, moved = inputs_of(drive(200)), {}
+    for kind in (Backlash, Wearing):
+        made = Actuator("lag", "first", INTERVAL, BoucWen(), span=SPAN, stages=(kind(),))
+        models = theta(made)
+        moved[kind] = walk(made, models, inputs)(inputs.samples)
+        expected = made.displacement(models, inputs)
+        np.testing.assert_allclose(moved[kind], expected, rtol=0, atol=1e-10)
+    assert np.abs(moved[Wearing] - moved[Backlash]).max() > 1.0
 
 
 class Aging(Temperature):
