@@ -35,6 +35,7 @@ from bwbayes.model.operator import OneStateStep, Operator
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
 from bwbayes.model.registry import HYSTERESIS, build_part
+from bwbayes.model.stages.backlash import Backlash
 from tests.app import small
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -127,6 +128,38 @@ class Unbounded(Bent):
         """Those of the operator."""
         slope, *others = super().parameters
         return replace(slope, bounds=lambda earlier: (earlier["alhpa"], np.inf)), *others
+
+
+class ChoosingStep(BentStep):
+    """The same step with a function that numba does not compile."""
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return w and its slope."""
+        return BentStep.move(parameters, memory, np.where(voltage > 1e9, 0.0, voltage), after)
+
+
+class Choosing(Bent):
+    """The operator of that step."""
+
+    def step(self, column: Values) -> ChoosingStep:
+        """Return the step."""
+        return ChoosingStep(super().step(column).parameters)
+
+
+def play(y: Any, value: Any, half: Any) -> Any:
+    """Return where a play stands, by a function that numba does not compile."""
+    return np.clip(y, value - half, value + half)
+
+
+class Playing(Backlash):
+    """A stage that calls it."""
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:
+        """Return y."""
+        after[0], after[1] = play(memory[0], value, parameters[0]), value
+        return after[0]
 
 
 class Stranger:
@@ -223,6 +256,30 @@ def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     assert (
         np.max(np.abs(one - other) / (posterior.single_record.voltage.size + np.abs(one))) < 1e-10
     )
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        ({"stages": [f"{HERE}:Playing"]}, r"Playing.move: .* `return np.clip\(.*\)` \(line \d+ of"),
+        ({"hysteresis": f"{HERE}:Choosing"}, r"ChoosingStep.move: .* `return BentStep.move\("),
+    ],
+)
+def test_what_numba_cannot_compile_is_one_clear_line(
+    model: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    """Which formula, its line, and what to write; NumPy's engine takes it."""
+    stated = config(tmp_path, BENT)
+    sampling = stated.sampling.model_copy(update={"walkers": 40})
+    stated = stated.model_copy(
+        update={"model": stated.model.model_copy(update=model), "sampling": sampling}
+    )
+    posterior = resolve_config(stated, tmp_path).study.posterior
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 3))
+    assert np.isfinite(replace(posterior, engine="numpy").log_likelihood(theta)).all()
+    refused = rf'^{HERE}:{said}[^\n]*bwbayes.arrays.select[^\n]*; or take engine = "numpy"$'
+    with pytest.raises(InputError, match=refused):
+        replace(posterior, engine="numba").log_likelihood(theta)
 
 
 @pytest.mark.usefixtures("_my_operator")

@@ -12,12 +12,16 @@ from __future__ import annotations
 import inspect
 import linecache
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from hashlib import sha256
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from numba import njit, types
+from numba.core.errors import NumbaError
 from numba.extending import (
     NativeValue,
     models,
@@ -29,6 +33,7 @@ from numba.extending import (
 )
 
 from bwbayes.arrays import anywhere, gone, look_up, select
+from bwbayes.errors import InputError
 from bwbayes.model.operator import HysteresisStep
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.stage import Stage
@@ -115,6 +120,34 @@ def compiled[Function: Callable[..., Any]](function: Function) -> Function:
     for helper in _functions(function)[1:]:
         register_jitable(**INNER)(helper)
     return cast("Function", njit(**INNER)(function))
+
+
+@contextmanager
+def compiling(owner: Any) -> Iterator[None]:
+    """Refuse what numba cannot compile of the formula that an owner brings.
+
+    Raises InputError: it cannot; the text names the formula, its line, and what it may be made of.
+    """
+    try:
+        yield
+    except NumbaError as error:
+        if owner is None:
+            raise
+        function = _formula_of(type(owner))
+        paths = [inspect.getfile(one) for one in _functions(function)]
+        files = {Path(path).name: path for path in paths}
+        where = "it"
+        # Numba says the innermost call first.
+        for name, line in re.findall(r'File "(?:[^"]*/)?([^"/]+)", line (\d+)', str(error)):
+            if name in files:
+                source = linecache.getline(files[name], int(line)).strip()
+                where = f"`{source}` (line {line} of {name})"
+                break
+        raise InputError(
+            f"{function.__module__}:{function.__qualname__}: numba cannot compile {where}; write "
+            "it with arithmetic, NumPy's functions of a number, and bwbayes.arrays.select in place "
+            'of np.where; or take engine = "numpy"'
+        ) from None
 
 
 def _functions(function: Callable[..., Any]) -> list[Callable[..., Any]]:

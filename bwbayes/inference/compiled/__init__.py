@@ -22,6 +22,7 @@ from bwbayes.inference.compiled.motion import Motion, Shared, physics, simulated
 from bwbayes.inference.compiled.stages import CompiledDrive, Given, advance_of, prepared
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.state_space import Noise
+from bwbayes.model.compiled import compiling
 from bwbayes.model.declaration import Values
 
 if TYPE_CHECKING:
@@ -77,7 +78,8 @@ def products(
         filters = FilterState.filled(filtering | responses, rows)
         filters["step"] = over[:, 0]
         motions = Motion.filled(named, rows)
-        kernels.sums(record, *source, shared, motions, filters, over, second, unknowns)
+        with compiling(source.owner):
+            kernels.sums(record, *source, shared, motions, filters, over, second, unknowns)
         models = source.models.equilibrium.size
         pairs[rows] = apart(filters["products"][:, pair], models)
         logs[rows] = apart(filters["log"], models)

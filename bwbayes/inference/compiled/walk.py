@@ -27,6 +27,7 @@ from bwbayes.inference.compiled.stages import (
     prepared,
 )
 from bwbayes.model.actuator import Actuator, each_model
+from bwbayes.model.compiled import compiling
 from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.operator import HysteresisStep, OneStateStep, Operator
@@ -109,7 +110,8 @@ def _walk_core(
         if isinstance(models, Given):
             drive, memory = advance(window, memory)
             models = models._replace(drive=np.ascontiguousarray(drive), begin=now)
-        _walk(source.owner, models, shared, motions, read_only(voltage), now, displacement)
+        with compiling(source.owner):
+            _walk(source.owner, models, shared, motions, read_only(voltage), now, displacement)
         now = last
         return displacement
 
@@ -192,7 +194,8 @@ def _advance_stage(
     result, after = np.empty(values.shape), memory.copy()
     seen = np.empty((0, 0)) if seen is None else seen.copy()  # numba compiles for this type alone
     values = read_only(np.ascontiguousarray(values))
-    _pass(stage, numbers.copy("C"), after, values, seen, result)
+    with compiling(stage):
+        _pass(stage, numbers.copy("C"), after, values, seen, result)
     return result, after
 
 
@@ -208,7 +211,8 @@ def _drive_of_own(
         # Add the row that tells its lanes whether any model is curved or depends on a sign.
         numbers = np.column_stack([numbers, np.full(len(numbers), step.curved or step.signed)])
     voltage = read_only(np.ascontiguousarray(voltage))
-    _pass(step, numbers, after, voltage, np.empty((0, 0)), drive)
+    with compiling(step):
+        _pass(step, numbers, after, voltage, np.empty((0, 0)), drive)
     return drive, after
 
 
