@@ -253,7 +253,8 @@ class Ranges:
     ``duration`` of the record, s; ``begin`` the time of its first reading, s. ``rounding`` is the
     sd of the rounding of readings that show no other noise, um; 0 where they show some.
     ``resolution`` is the least sd of a sensor whose readings jump too often to show their noise,
-    um; 0 where they show it. ``covariates`` are the least and the largest value of each, by name.
+    um; 0 where they show it. ``covariates`` are the least and the largest value of each, by name;
+    :meth:`covariate` has those of one.
     """
 
     voltage: float
@@ -268,9 +269,16 @@ class Ranges:
     begin: float = 0.0
     covariates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
+    def covariate(self, name: str) -> tuple[float, float]:
+        """Return a covariate's least and largest value; 0 and 1 where none was recorded.
+
+        A model that needs a covariate is not fitted without it, but shows its default priors.
+        """
+        return self.covariates.get(name, (0.0, 1.0))
+
     def middle_of(self, covariate: str) -> float:
         """Return the middle of a covariate's range."""
-        return sum(self.covariates[covariate]) / 2
+        return sum(self.covariate(covariate)) / 2
 
     @property
     def slope(self) -> float:

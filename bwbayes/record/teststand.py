@@ -343,7 +343,6 @@ RING_BENDER = Ranges(
     time=0.5,
     interval=1e-3,
     duration=16.0,
-    covariates={"temperature_degC": (20.0, 25.0), "load_N": (0.0, 10.0)},
 )
 
 # True values where medians are no guide: other parameters' bounds cut the prior, or it is centered

@@ -17,6 +17,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.config.keywords import config_of
+from bwbayes.app.config.reference import parts_reference
 from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run
 from bwbayes.app.jobs.predict import planned_noise
 from bwbayes.app.running.explaining import choose_model
@@ -29,6 +30,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Declaration, normal
 from bwbayes.model.inputs import Inputs, Limits
 from bwbayes.model.stages.gain import MovingGain, Temperature, TemperatureOffset
 from bwbayes.prediction.prediction import predict_record, predict_windows
@@ -250,6 +252,28 @@ def test_a_model_that_needs_a_covariate_is_refused_without(tmp_path: Path, stage
     config, records = config_of(bare, {"stages": [stage]})
     with pytest.raises(bw.InputError, match=r"^\w+: .*, and name its column in covariates"):
         resolve_config(config, tmp_path, records)
+
+
+class Damp(Temperature):
+    """Gain that follows the humidity."""
+
+    name, sees = "damp", ("humidity_percent",)
+    parameters = (
+        Declaration("damp_gain", "1/percent", "c", "change", lambda _: normal(0.0, 1e-3)),
+        Declaration(
+            "damp_reference",
+            "percent",
+            "RH_0",
+            "humidity of no change",
+            lambda context: context.ranges.middle_of("humidity_percent"),
+        ),
+    )
+
+
+def test_default_priors_are_shown_that_follow_any_covariate() -> None:
+    said = " ".join(parts_reference("tests.app.test_temperature:Damp").split())
+    assert "0.5 s from turn to turn, humidity_percent from 0 to 1); they scale" in said
+    assert "damp_reference (percent): humidity of no change of the actuator; fixed at 0.5" in said
 
 
 # An actuator that heats itself: no temperature is recorded, and the search finds out

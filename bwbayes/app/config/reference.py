@@ -170,14 +170,16 @@ def _part(kind: str, name: str, component: Any) -> str:
     declared: Sequence[Declaration] = (
         component.declarations if hasattr(component, "declarations") else component.parameters
     )
+    seen = sorted({*getattr(component, "sees", ())} - {"time", "voltage"})
     if declared:
         lines += [
             "",
             _wrapped(
                 "Parameters, with the default priors that they have at the ring bender's ranges "
                 f"(+-{RING_BENDER.voltage:g} V, +-{RING_BENDER.displacement:g} um, "
-                f"{RING_BENDER.time:g} s from turn to turn); they scale with those of a record. "
-                "`bwbayes check` prints yours."
+                f"{RING_BENDER.time:g} s from turn to turn"
+                f"{''.join(f', {name} from 0 to 1' for name in seen)}); they scale with those of a "
+                "record. `bwbayes check` prints yours."
             ),
         ]
     for _, numbered in groupby(

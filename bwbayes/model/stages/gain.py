@@ -177,7 +177,7 @@ class Covariate(NamedTuple):
 
 def _load_per_newton(ranges: Ranges) -> float:
     """Let half of the load's range change a tenth."""
-    low, high = ranges.covariates["load_N"]
+    low, high = ranges.covariate("load_N")
     return 0.2 / (high - low) if high > low else 0.0
 
 
