@@ -180,7 +180,8 @@ class Inputs:
             return self.covariates[name]
         raise InputError(
             f"{name}: the model needs it at every sample, and this voltage comes without; give a "
-            "record that has it, and name its column in covariates"
+            "record that has it, as a constant column if it stays the same, and name its column in "
+            "covariates"
         )
 
 
