@@ -58,7 +58,7 @@ def test_samples_keep_their_times(samples: int, first: int, last: int, step: int
 
 def test_what_is_not_known_is_refused() -> None:
     whole = inputs_of(10)
-    with pytest.raises(InputError, match="pressure: the model needs it at .* a constant column"):
+    with pytest.raises(InputError, match=r"pressure: the model needs it at .* a constant column"):
         whole.column("pressure")
     with pytest.raises(InputError, match="temperature_degC: the model needs it at every sample"):
         whole.followed_by(Inputs(whole.voltage, interval=COARSE))
