@@ -17,12 +17,14 @@ interrupted and resumes, gives the same bits.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from itertools import repeat
+from typing import Any, NamedTuple
 
 import emcee
 import numpy as np
 from emcee import moves
 from emcee.model import Model
+from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
@@ -98,10 +100,14 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
         self.proposal, self.tries, self.ahead = proposal, tries, ahead
         self._drawn: list[_Tries] = []
         self._left: tuple[FloatArray, FloatArray] | None = None
+        self._log_prob_fn: object = None
 
     def propose(self, model: Model, state: emcee.State) -> tuple[emcee.State, BoolArray]:
         """Propose for all walkers, as the interface of emcee's moves requires."""
         walkers = len(state.coords)
+        if model.log_prob_fn is not self._log_prob_fn:
+            # Another sampler may have another density, or other walkers.
+            self._drawn, self._left, self._log_prob_fn = [], None, model.log_prob_fn
         if not self._drawn:
             self._drawn = [*self._draw(model, walkers)]
         tries = self._drawn.pop(0)
@@ -110,7 +116,11 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
             here, tries.log_weight, model.random.rand(walkers)
         )
         rows = np.arange(walkers)
-        proposed = emcee.State(tries.coords[which, rows], log_prob=tries.log_prob[which, rows])
+        proposed = emcee.State(
+            tries.coords[which, rows],
+            log_prob=tries.log_prob[which, rows],
+            blobs=None if tries.blobs is None else tries.blobs[which, rows],
+        )
         state = self.update(state, proposed, accepted)
         self._left = state.coords.copy(), np.where(accepted, log_weight, here)
         return state, accepted
@@ -146,22 +156,27 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
         """Draw the tries of the next steps, and compute their densities at once."""
         count = self.ahead * self.tries * walkers
         coords, log_density = self.proposal.evaluate(self.proposal.draw(model.random, count))
-        log_prob, _ = model.compute_log_prob_fn(coords)
+        log_prob, blobs = model.compute_log_prob_fn(coords)
         shape = self.ahead, self.tries, walkers
         yield from map(
             _Tries,
             coords.reshape(*shape, -1),
             log_prob.reshape(shape),
             (log_prob - log_density).reshape(shape),
+            repeat(None) if blobs is None else blobs.reshape(*shape, *blobs.shape[1:]),
         )
 
 
 class _Tries(NamedTuple):
-    """Tries of a step: ``coords`` (tries, walkers, free), log π and log w (tries, walkers)."""
+    """Tries of a step: ``coords`` (tries, walkers, free), log π and log w (tries, walkers).
+
+    ``blobs`` (tries, walkers, ...) are what the density returns beside log π, as emcee has it.
+    """
 
     coords: FloatArray
     log_prob: FloatArray
     log_weight: FloatArray
+    blobs: NDArray[Any] | None
 
 
 class Counted(moves.Move):  # type: ignore[misc]

@@ -106,3 +106,46 @@ def test_a_step_to_one_of_several_places_and_its_way_back_are_in_balance(logs: l
         assert (chosen == weight[one, np.arange(grid.size)]).all()
         flows.append(np.exp(logs[first] - max(logs)) * np.mean(taken & (one == 0)))
     assert flows[0] == pytest.approx(flows[1], abs=5e-5)
+
+
+@pytest.mark.parametrize("tries", [1, 3])
+@pytest.mark.parametrize("ahead", [1, 4])
+@pytest.mark.parametrize("blobs_dtype", [None, [("first", float), ("both", float, (2,))]])
+def test_a_blob_goes_with_its_place(ahead: int, tries: int, blobs_dtype: Any) -> None:
+    """What emcee stores beside each place is what the density returned there."""
+    known = TARGETS["banana"]
+
+    def density(x: FloatArray) -> tuple[float, ...]:
+        further = x if blobs_dtype is None else (x[0], x)
+        return (known.log_density(x[np.newaxis])[0], *further)
+
+    move = IndependenceMove(fitted("banana"), tries, ahead)
+    sampler = emcee.EnsembleSampler(
+        10, 2, density, moves=[(move, 0.7), (DEMove(), 0.3)], blobs_dtype=blobs_dtype
+    )
+    sampler.run_mcmc(known.draw(np.random.default_rng(3), 10), 30)
+    chain, blobs = sampler.get_chain(), sampler.get_blobs()
+    assert np.mean(sampler.acceptance_fraction) > 0.3
+    if blobs_dtype is None:
+        np.testing.assert_array_equal(blobs, chain)
+    else:
+        np.testing.assert_array_equal(blobs["first"], chain[..., 0])
+        np.testing.assert_array_equal(blobs["both"], chain)
+
+
+@pytest.mark.parametrize("walkers", [12, 20])
+def test_a_move_serves_another_sampler(walkers: int) -> None:
+    """Of as many walkers or others, from where the first ended: nothing is left of its density."""
+    known = TARGETS["banana"]
+    move = IndependenceMove(fitted("banana"), ahead=4)
+
+    def shifted(x: FloatArray) -> FloatArray:
+        return np.asarray(known.log_density(x) + 5)
+
+    end = known.draw(np.random.default_rng(4), 20)
+    for density, count in ((known.log_density, 20), (shifted, walkers)):
+        sampler = emcee.EnsembleSampler(count, 2, density, moves=move, vectorize=True)
+        end = sampler.run_mcmc(end[:count], 7).coords
+        stored = sampler.get_log_prob(flat=True)
+        np.testing.assert_allclose(stored, density(sampler.get_chain(flat=True)), rtol=1e-12)
+        assert 0.3 < np.mean(sampler.acceptance_fraction) < 0.999
