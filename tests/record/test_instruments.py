@@ -1,7 +1,9 @@
 """Every form in which a bench writes a record is read, with as little said as possible."""
 
+import gzip
 import math
 import warnings
+from codecs import BOM_UTF8
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,10 @@ from openpyxl import Workbook
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
+from bwbayes.record.io import formats
+from bwbayes.record.io.series import Source, array_source
 from tests.record.conftest import quiet
-from tests.record.instruments import DISPLACEMENT, INTERVAL, TIME, VOLTAGE, Written
+from tests.record.instruments import DISPLACEMENT, INTERVAL, TEXTS, TIME, VOLTAGE, Written
 from tests.record.makers import INSTRUMENTS
 
 
@@ -66,6 +70,44 @@ def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
         assert (error.fs is not None) == (name in timeless | {"data recorder of PI"})
     else:
         assert error is None
+
+
+@pytest.mark.parametrize("name", INSTRUMENTS)
+def test_every_text_may_be_packed_by_gzip_and_no_other_file(tmp_path: Path, name: str) -> None:
+    written = INSTRUMENTS[name](tmp_path)
+    packed = written.path.with_name(f"{written.path.name}.gz")
+    packed.write_bytes(gzip.compress(written.path.read_bytes()))
+    if name in TEXTS:
+        record = read(written._replace(path=packed))
+        np.testing.assert_array_equal(record.voltage, read(written).voltage)
+    else:
+        with pytest.raises(InputError, match=r"\.gz: packed by gzip, .*; unpack it$"):
+            read(written._replace(path=packed))
+
+
+def read_marked(path: Path) -> Source:
+    """Read a text with a mark above its rows of V and um at a known interval."""
+    _, *rows = path.read_text(encoding="utf-8-sig").splitlines()
+    voltage, displacement = np.array([row.split() for row in rows], dtype=float).T
+    return array_source(path.name, {"voltage_V": voltage, "displacement_um": displacement}, 5e-3)
+
+
+def test_a_text_format_is_told_by_its_mark_behind_a_byte_order_mark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its reader gets it, and none of it is taken for columns by the reader of any text."""
+    added = formats.Format(b"SCOPE TEXT", ".scp", f"{__name__}:read_marked")
+    monkeypatch.setattr(formats, "FORMATS", (*formats.FORMATS, added))
+    rows = [f"{v} {d}" for v, d in zip(VOLTAGE, DISPLACEMENT, strict=True)]
+    content = "\n".join(["SCOPE TEXT", *rows]).encode()
+    for before in (b"", BOM_UTF8):
+        (tmp_path / "a.txt").write_bytes(before + content)
+        record = read_record(tmp_path / "a.txt")
+        assert record.interval == INTERVAL
+        np.testing.assert_array_equal(record.displacement, DISPLACEMENT)
+        (tmp_path / "a.gz").write_bytes(gzip.compress(before + content))
+        with pytest.raises(InputError, match=r"a\.gz: packed by gzip, .*; unpack it$"):
+            read_record(tmp_path / "a.gz")
 
 
 def test_a_clock_counts_from_the_first_sample_and_is_kept(tmp_path: Path) -> None:

@@ -8,8 +8,10 @@ binary formats.
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
+from codecs import BOM_UTF8
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -45,7 +47,8 @@ _BINARY = (".h5", ".hdf5", ".mat")
 class Format(NamedTuple):
     """A file format: the first bytes of its content, the suffix of its names, and its reader.
 
-    The reader goes by its import path, ``module:function``, and is loaded when it is needed.
+    A byte order mark of UTF-8 before them does not count. The reader goes by its import path,
+    ``module:function``, and is loaded when it is needed.
     """
 
     mark: bytes
@@ -226,11 +229,25 @@ def read_source(path: Path, table: int | str | None = None) -> Source:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
     try:
-        return _reader(path, begin, table)(path)
+        if begin.startswith(b"\x1f\x8b"):
+            _refuse_packed(path)
+        return _reader(path, begin.removeprefix(BOM_UTF8), table)(path)
     except (InputError, Warning):
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error
+
+
+def _refuse_packed(path: Path) -> None:
+    """Refuse a file packed by gzip with a format's mark inside: a format's reader unpacks none.
+
+    Raises InputError: it has one.
+    """
+    with gzip.open(path) as file:
+        begin = file.read(64).removeprefix(BOM_UTF8)
+    for mark in (b"\x89HDF", b"PK", *(file_format.mark for file_format in FORMATS)):
+        if begin.startswith(mark):
+            raise InputError(f"{path}: packed by gzip, which only plain text may be; unpack it")
 
 
 def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path], Source]:
