@@ -78,7 +78,7 @@ class Explanation(Finding):
     actuator, so that a fit without it has followed it. An explanation by ``noise`` leaves the
     displacement as it is. ``spec`` is the model that it is a part of, ``stated`` holds the priors
     of new parameters, ``coordinates`` (free,) are those of its fit, and ``cost`` is the cost of its
-    choice, nats.
+    choice, nats. ``advice`` is the fix that leaves the model as it is, if there is one.
     """
 
     rmse: tuple[float, float] = (np.nan, np.nan)
@@ -90,6 +90,7 @@ class Explanation(Finding):
     stated: Mapping[str, Stated] = field(default_factory=dict)
     coordinates: FloatArray | None = field(default=None, repr=False, compare=False)
     cost: float = 0.0
+    advice: str = ""
 
     @property
     def mends(self) -> bool:
@@ -497,6 +498,7 @@ class ResidualAnalysis:
             spec=spec,
             stated=stated,
             coordinates=fit.coordinates,
+            advice=advice,
             **flags,
         )
 

@@ -37,7 +37,14 @@ from tests.diagnosis.plants import plant
 from tests.stand import Stand, autoregressive, play
 from tests.test_sampling_rates import records
 
-SLOW_EVENTS = ("drift", "transient", "mains", "moving gain")
+# What a run says of a stage that it has added: what to do on the test stand.
+FIXES = {
+    "step": r"fit one side: set train to end or begin at [\d.]+",
+    "drift": "measure again after a longer warm-up",
+    "transient": "measure again once the displacement has settled",
+    "mains": "look for the source: mains, ground loops, vibration",
+    "moving gain": "measure at a constant temperature; or measure when it has warmed up, or .*",
+}
 
 
 def config_of(kind: str, folder: Path) -> Config:
@@ -101,7 +108,7 @@ def test_nothing_is_added_to_a_right_model(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "kind",
-    ["step", *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_EVENTS)],
+    ["step", *(pytest.param(k, marks=pytest.mark.slow) for k in FIXES if k != "step")],
 )
 def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_of_the_next(
     kind: str, tmp_path: Path
@@ -115,6 +122,9 @@ def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_o
             problem, point = chosen.run, chosen.point
             stage = "oscillation" if kind == "mains" else kind.replace(" ", "-")
             assert problem.config.model.stages == [stage]
+            remarks = problem.config.records["record"].remarks or []
+            (added,) = [remark for remark in remarks if remark.startswith("stage added: ")]
+            assert re.search(rf"\. Fix: {FIXES[kind]}\.$", added), added
         else:
             point = pointfit.fit(problem.study.posterior, np.random.default_rng(1))
         posterior, rng = problem.study.posterior, np.random.default_rng(2)

@@ -211,7 +211,7 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
             new = [stage for stage in chosen.spec.chain if stage not in run.study.spec.chain]
             added = (*new, chosen.kind)[0]
             gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
-            notes[added], note = f"stage added: {gain}", f"added: {gain}"
+            notes[added], note = f"stage added: {gain}{_fix(parts)}", f"added: {gain}"
             others = [cause.spec for cause in parts if cause.spec and cause is not chosen]
             ties[added] = chosen.spec, others
         else:
@@ -245,6 +245,12 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
         tied=[spec.changes_to(other) for other in _tied(spec, ties.values())],
     )
     return ChosenModel(run, point, (*steps, *why), None if is_over else {name: explanations})
+
+
+def _fix(causes: Sequence[Explanation]) -> str:
+    """Return what to do on the test stand about causes, as the end of a note on them."""
+    advice = "; or ".join(dict.fromkeys(cause.advice for cause in causes if cause.advice))
+    return f". Fix: {advice}." if advice else ""
 
 
 def _fitted(run: Run, is_open: bool, watch: WatchSteps) -> tuple[Run, MAPEstimate, tuple[str, ...]]:
