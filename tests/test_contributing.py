@@ -179,7 +179,7 @@ def test_a_sampler_of_ones_own_goes_on_where_a_run_ended(
     assert 0.1 < np.mean(sampler.acceptance_fraction)
 
 
-# A second product, which falls short.
+# A second product, which falls short; its type hints are quoted, and it shows no progress.
 SHORT = '''
 from bwbayes.errors import ExitStatus
 
@@ -188,7 +188,7 @@ class Far(Reach):
     shortfall = "it does not move far enough"
     exit_status = ExitStatus.VALIDATION_INCONCLUSIVE
 
-def very_far(fit: Run, least: float, watch: WatchSteps = unwatched) -> Far:
+def very_far(fit: "Run", least: "float") -> "Far":
     """Say whether it moves far."""
     return Far(least, fit.standing)
 '''

@@ -4,7 +4,7 @@ A verb is a function. Its positional arguments are words of the command, its key
 options of the same names, types and defaults. The help is the docstring: its text before the
 parameters, the first sentence on each parameter, and the first command among the examples.
 
-`VERBS` are functions of a ``fit`` and a ``watch`` that return a
+`VERBS` are functions of a ``fit: Run``, and of a ``watch`` if they show progress, that return a
 :class:`~bwbayes.report.report.Product`. Their commands take the FOLDER of a run, show the progress,
 save and show the product, and end with the worse of the run's and the product's status; their
 methods of :class:`bwbayes.Run` warn where the commands show a note. `COMMANDS` are all others. They
@@ -124,14 +124,18 @@ class Verb:
     @property
     def product(self) -> str:
         """The type of what it returns; of several, the first."""
-        returned = ast.unparse(self._source.returns) if self._source.returns else ""
-        return returned.partition(" | ")[0]
+        return _hint(self._source.returns).partition(" | ")[0]
 
     @property
     def is_of_run(self) -> bool:
         """Whether its first argument is a fit."""
-        first = self._source.args.args[:1]
-        return any(arg.annotation and ast.unparse(arg.annotation) == "Run" for arg in first)
+        return any(_hint(arg.annotation) == "Run" for arg in self._source.args.args[:1])
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether it takes a ``watch``, which is told how far it is."""
+        args = self._source.args
+        return any(arg.arg == "watch" for arg in (*args.args, *args.kwonlyargs))
 
     @property
     def words(self) -> list[tuple[str, str, Literal["one", "optional", "several"]]]:
@@ -146,12 +150,12 @@ class Verb:
         for arg, default in zip(args.args, defaults, strict=True):
             # A run's folder for files is --out, as of any command of one.
             is_word = default in ("", "None") and not (self.is_of_run and arg.arg == "folder")
-            if arg.annotation and is_word:
-                hint = ast.unparse(arg.annotation)
+            hint = _hint(arg.annotation)
+            if hint and is_word:
                 optional = self.either or hint.endswith(" | None")
                 words.append((arg.arg, hint, "optional" if optional else "one"))
         if args.vararg is not None and args.vararg.annotation is not None:
-            words.append((args.vararg.arg, ast.unparse(args.vararg.annotation), "several"))
+            words.append((args.vararg.arg, _hint(args.vararg.annotation), "several"))
         return words[1:] if self.is_of_run else words
 
     def options(self) -> dict[str, tuple[str, Any, str]]:
@@ -164,7 +168,7 @@ class Verb:
         options = dict[str, tuple[str, Any, str]]()
         for arg, default in zip(args.kwonlyargs, args.kw_defaults, strict=True):
             if arg.annotation and arg.arg not in ("folder", "progress", "watch"):
-                hint = ast.unparse(arg.annotation).removesuffix(" | None")
+                hint = _hint(arg.annotation).removesuffix(" | None")
                 value = None if default is None else ast.literal_eval(default)
                 text = self.sentences(arg.arg)[0] or further.get(arg.arg, ("", None, ""))[2]
                 options[arg.arg] = hint, value, text
@@ -174,6 +178,11 @@ class Verb:
             for key, option in further.items()
             if key not in options and key not in words
         }
+
+
+def _hint(annotation: ast.expr | None) -> str:
+    """Return a type hint as it is written, without quotes around it; none is empty."""
+    return ast.unparse(annotation).strip("'\"") if annotation else ""
 
 
 # Verbs of a run.

@@ -173,9 +173,11 @@ def _make_product(
         # Refuse before the computation; saving refuses every single file.
         refuse_existing(verb.load(verb.product).files(out), overwrite=overwrite)
         fit = open_converged(folder)
+        if verb.is_watched:
+            options["watch"] = watch
         try:
             with fit.quantities.spoken():
-                product = verb.load()(fit, *arguments, watch=watch, **options)
+                product = verb.load()(fit, *arguments, **options)
         except ColumnsError as error:
             raise error.in_command(command_as_typed()) from None
         product.said_in(fit.quantities)
