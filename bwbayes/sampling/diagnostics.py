@@ -82,6 +82,12 @@ class ConvergenceDiagnostics:
         steps = self.steps * (self.walker_rhat**2 - 1) / (MAX_WALKER_RHAT**2 - 1)
         return float(f"{steps:.1e}")
 
+    def steps_for(self, ess: float) -> float:
+        """Return the steps for ``ess`` effective draws and :data:`LENGTH` autocorrelation times."""
+        with np.errstate(divide="ignore"):
+            draws = np.divide(self.steps * ess, self.lowest_ess)  # by zero if none moves
+        return float(np.maximum(draws, LENGTH * np.max(self.autocorrelation)))
+
     def failures(self, ess: float, fraction: float = 1.0) -> list[str]:
         """Return the reasons against convergence with ``ess`` effective draws, if any.
 

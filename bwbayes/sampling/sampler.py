@@ -346,9 +346,7 @@ def _next_check(
     blocks.
     """
     fraction = 1.0 if passed else FIRST_PART
-    with np.errstate(divide="ignore"):
-        draws = np.divide(latest.steps * plan.ess, latest.lowest_ess)  # by zero if none moves
-        steps = np.maximum(draws, LENGTH * np.max(latest.autocorrelation))
+    steps = latest.steps_for(plan.ess)
     following = max(fraction * steps / plan.block, MIN_CHECK_GROWTH * passed)
     if not following > blocks:  # nan too
         following = LEAST_STRETCH * blocks

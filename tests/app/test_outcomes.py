@@ -72,6 +72,25 @@ def test_line_on_the_screen_says_what_to_do(
     assert 2 * 25 <= int(steps) < 1000
 
 
+def test_the_steps_that_are_advised_lead_to_convergence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each advice at least doubles what was sampled, also where the limit ends within a block."""
+    small.without_explanations(monkeypatch)
+    made = small.begun(tmp_path / "a", ("block = 25", "block = 25\nsteps = 4"))
+    status, taken = finish(made.path, workers=1, quiet=True), [0]
+    while status == 4:
+        (steps,) = re.findall(r"--steps (\d+)`", capsys.readouterr().err)
+        taken.append(ChainFile.read(made.chain).steps("sampling"))
+        assert taken[-1] >= 2 * taken[-2]
+        check = bw.open_run(made.path).outcome.check
+        assert int(steps) >= max(2 * taken[-1], 50 * np.max(check.autocorrelation))
+        assert int(steps) >= taken[-1] * 200 / check.lowest_ess
+        status = finish(made.path, workers=1, quiet=True, steps=int(steps))
+    assert (0, 0, 25) == (status, *taken[:2])
+    assert len(taken) <= 4
+
+
 @pytest.mark.parametrize(
     "command",
     [

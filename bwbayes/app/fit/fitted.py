@@ -198,9 +198,12 @@ class Run(Shown):
 
     @property
     def more_steps(self) -> int:
-        """Twice the steps that the sampling had, or all it needs."""
-        needed = np.nan_to_num(self.outcome.check.steps_needed, posinf=0.0)
-        return max(2 * self.config.sampling.steps, int(needed))
+        """Twice the steps that the sampling had or was allowed, or all that it seems to need."""
+        check = self.outcome.check
+        # Blocks are whole: there may be more steps than the limit.
+        taken = max(self.config.sampling.steps, check.steps)
+        needed = [check.steps_needed, check.steps_for(self.plan.ess)]
+        return max(2 * taken, int(np.ceil(np.max(np.nan_to_num(needed, posinf=0.0)))))
 
     @property
     def resuming(self) -> str:
