@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 import bwbayes
+from bwbayes.app.config.config import load
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis import explanations
 from bwbayes.diagnosis.defects import DEFECTS
@@ -35,7 +37,7 @@ TEXT = (Path(__file__).resolve().parents[1] / "CONTRIBUTING.md").read_text(encod
 
 
 def example(name: str) -> str:
-    found = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```", TEXT, re.DOTALL)
+    found = re.search(rf"<!-- example: {name} -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
     assert found is not None
     return found[1]
 
@@ -51,17 +53,17 @@ def test_the_noise_is_the_gaussian_that_it_says_it_is() -> None:
     """Alone and with another one, against the dense covariance."""
     swinging = names_of("my_noise.py")["Swinging"](0.05)
     time = 0.05 * np.abs(np.subtract.outer(np.arange(60), np.arange(60)))
-    covariance = 4 * np.exp(-time / 0.3) * np.cos(time / 0.3) + 0.01 * np.eye(60)
+    covariance = 4 * np.exp(-time / 0.3) * np.cos(2 * np.pi * time / 0.8) + 0.01 * np.eye(60)
     residual = np.random.default_rng(1).standard_normal(60)
 
     def dense(covariance: np.ndarray) -> float:
         inverse, volume = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
         return float(-0.5 * (residual @ inverse @ residual + volume + 60 * np.log(2 * np.pi)))
 
-    theta = np.array([[0.1, 2.0, 0.3]])
+    theta = np.array([[0.1, 2.0, 0.3, 0.8]])
     (density,) = swinging.log_density(theta, residual[np.newaxis])
     assert density == pytest.approx(dense(covariance), abs=1e-8)
-    both, more = swinging + DiscrepancyNoise(0.05), np.array([[0.1, 2.0, 0.3, 0.5, 1.0]])
+    both, more = swinging + DiscrepancyNoise(0.05), np.array([[0.1, 2.0, 0.3, 0.8, 0.5, 1.0]])
     (density,) = both.log_density(more, residual[np.newaxis])
     assert density == pytest.approx(dense(covariance + 0.25 * np.exp(-time)), abs=1e-8)
 
@@ -89,6 +91,27 @@ def test_a_stage_of_ones_own_is_in_the_chain(
     command = inverse(made, theta[:1], displacement[:1], from_rest=True)
     again = made.displacement(theta[:1], command[0], from_rest=True)
     np.testing.assert_allclose(again, displacement[:1], rtol=0, atol=1e-8)
+
+
+def test_the_stand_tries_a_stage_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit finds its parameter within four sds, which are small; both engines give one density."""
+    for name in ("my_stage.py", "try.toml"):
+        (tmp_path / name).write_text(example(name), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    posterior = resolve_config(load(tmp_path / "try.toml"), tmp_path).study.posterior
+    rng = np.random.default_rng(1)
+    theta = posterior.prior.theta(posterior.prior.draw(rng, 3))
+    density = posterior.log_likelihood(theta)
+    compiled = replace(posterior, engine="numba")
+    assert posterior.engine == "numpy"
+    np.testing.assert_allclose(compiled.log_likelihood(theta), density, rtol=1e-9)
+    point = map_estimate.fit(compiled, rng)
+    near, _ = compiled.prior.constrain(rng.multivariate_normal(point.mode, point.covariance, 1000))
+    found = near[:, compiled.names.index("softness")]
+    assert abs(np.mean(found) - 500.0) < 4 * np.std(found)
+    assert np.std(found) < 50.0
 
 
 def test_an_operator_of_ones_own_is_simulated_fast_and_inverted(
