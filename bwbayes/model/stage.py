@@ -14,8 +14,10 @@ with it, compiled it moves one after the other (:mod:`bwbayes.model.compiled`), 
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -118,9 +120,24 @@ class Stage(ABC):
     def settled(self, numbers: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models,) at rest at a value (models,), and the memory there."""
         memory = np.empty((self.remembers, value.size))
-        if not self.remembers:
-            return np.asarray(self.move(numbers.T, memory, value, memory)), memory.T
-        return np.asarray(self.settle(numbers.T, value, memory)), memory.T
+        with self._taking_all_models():
+            if not self.remembers:
+                return np.asarray(self.move(numbers.T, memory, value, memory)), memory.T
+            return np.asarray(self.settle(numbers.T, value, memory)), memory.T
+
+    @contextmanager
+    def _taking_all_models(self) -> Iterator[None]:
+        """Refuse a formula that is of one number: it has an ``if``, or a function of ``math``."""
+        try:
+            yield
+        except (TypeError, ValueError) as error:
+            if not re.search("truth value|Python scalars", str(error)):
+                raise
+            raise InputError(
+                f"{type(self).__module__}:{type(self).__qualname__}: its formula takes one number, "
+                "not all models at once; write bwbayes.arrays.select(condition, yes, no) in place "
+                "of if, and NumPy's functions in place of those of math"
+            ) from None
 
     def begin(
         self,
@@ -153,14 +170,16 @@ class Stage(ABC):
             known = [*numbers.T[..., np.newaxis]]
             if seen is not None:
                 known[len(known) - len(seen) :] = seen
-            return np.asarray(self.move(known, memory.T, values, memory.T)), memory
+            with self._taking_all_models():
+                return np.asarray(self.move(known, memory.T, values, memory.T)), memory
         result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
-        for sample in range(values.shape[1]):
-            if seen is not None:
-                rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]
-            result[:, sample] = self.move(rows, now, values[:, sample], after)
-            now, after = after, now
+        with self._taking_all_models():
+            for sample in range(values.shape[1]):
+                if seen is not None:
+                    rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]
+                result[:, sample] = self.move(rows, now, values[:, sample], after)
+                now, after = after, now
         return result, now.T.copy()
 
     def inverse(
@@ -180,12 +199,13 @@ class Stage(ABC):
         self.require_inverse()
         result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
-        for sample in range(values.shape[1]):
-            if seen is not None:
-                rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]
-            result[:, sample] = self.undo(rows, now, values[:, sample])
-            self.move(rows, now, result[:, sample], after)
-            now, after = after, now
+        with self._taking_all_models():
+            for sample in range(values.shape[1]):
+                if seen is not None:
+                    rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]
+                result[:, sample] = self.undo(rows, now, values[:, sample])
+                self.move(rows, now, result[:, sample], after)
+                now, after = after, now
         return result
 
     def response(self, numbers: FloatArray, angles: FloatArray) -> ComplexArray | float:  # noqa: ARG002

@@ -5,6 +5,7 @@ inverse, a model at a controller's pace and its C file have to agree with the wh
 """
 
 import ctypes
+import math
 from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
@@ -37,8 +38,9 @@ from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
 from bwbayes.model.stages.amplifier_limits import Saturation
 from bwbayes.model.stages.backlash import Backlash
-from bwbayes.model.stages.gain import Temperature
+from bwbayes.model.stages.gain import Heating, Temperature
 from bwbayes.model.stages.lags import Delay
+from bwbayes.model.stages.sensor import ReversedSign
 from bwbayes.record.teststand import RING_BENDER, true_values
 from tests.control.compiled import Compiled, compiled_functions
 from tests.programs import needs
@@ -516,6 +518,50 @@ def test_a_stage_without_undo_is_refused_in_one_line_where_a_command_is_asked_fo
     assert "no command undoes" in str(
         exported("one way", made, models[0], Limits(*SPAN)).without_inverse
     )
+
+
+class Branching(ReversedSign):
+    """A formula of one number."""
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return y."""
+        return value if value > 0.0 else -value
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
+        """Return x."""
+        return math.tan(value)
+
+
+class Remembering(Branching):
+    """The same with a memory."""
+
+    remembers = 1
+
+    @staticmethod
+    def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return x."""
+        return min(value, 1.0)
+
+
+@pytest.mark.parametrize("kind", [Branching, Remembering])
+def test_a_formula_of_one_number_is_refused_in_one_line(kind: type[Stage]) -> None:
+    """Wherever it is met first; what else goes wrong in it keeps its traceback."""
+    stage, numbers, memory = kind(), np.empty((2, 0)), np.zeros((2, kind.remembers))
+    values = np.array([[1.0, -1.0], [2.0, 3.0]])
+    refused = (
+        rf"^{__name__}:{kind.__name__}: its formula takes one number, .* in place of if, [^\n]*$"
+    )
+    for ask in (
+        lambda: stage.settled(numbers, values[:, 0]),
+        lambda: stage.advance(numbers, memory, values),
+        lambda: stage.inverse(numbers, memory, values),
+    ):
+        with pytest.raises(InputError, match=refused):
+            ask()
+    with pytest.raises(ValueError, match="could not be broadcast"):
+        Heating().advance(np.ones((2, 5)), np.zeros((3, 2)), values)
 
 
 class Wearing(Backlash):
