@@ -95,7 +95,10 @@ def fit(
         places, noise, spread = _places(posterior, generator, watch=part(watch, 0.0, 0.5))
         for start_point in watched(places, part(watch, 0.5, 0.9)):
             _add_mode(posterior, modes, start_point)
-        for start_point in _zero_noise_starts(posterior, modes[0].coordinates, noise):
+        for start_point in _zero_noise_starts(posterior, modes[0].coordinates, noise[:DRAWS]):
+            _add_mode(posterior, modes, start_point)
+        (aside,) = generator.spawn(1)
+        for start_point in _other_noise_starts(posterior, modes[0], noise, aside):
             _add_mode(posterior, modes, start_point)
         for start_point in _exchanged_starts(posterior, modes[0].coordinates):
             _add_mode(posterior, modes, start_point)
@@ -185,8 +188,8 @@ def _places(
         optima += _distinct_minima(
             least_squares, least_squares.optima(draws[order[:starts]], tolerance, of_steps)
         )
-    noise = draws[:DRAWS, ~least_squares.physical]
-    places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]
+    noise = draws[:, ~least_squares.physical]
+    places = [_with_noise(posterior, optimum, noise[:DRAWS], generator) for optimum in optima]
     # A place that least squares allows may still have no density: the noise is another one there.
     possible = np.isfinite(posterior.log_density(np.stack(places)))
     likeliest = draws[int(np.argmax(density))]
@@ -256,6 +259,25 @@ def _zero_noise_starts(
         places = _beside(start_point, resting)
         start[:] = places[int(np.argmax(posterior.log_density(places)))]
     return starts
+
+
+def _other_noise_starts(
+    posterior: Posterior, mode: Mode, noise: FloatArray, generator: np.random.Generator
+) -> FloatArray:
+    """Return starts (any, free) with a mode's displacement and other noise, if any is likely.
+
+    What prior draws (draws, noise) lead to depends on chance where the noise has several modes: so
+    they are tried part by part.
+    """
+    target = Target(posterior)
+    places = [
+        _with_noise(posterior, mode.coordinates, few, generator)
+        for few in np.split(noise, 2 * len(noise) // DRAWS)
+    ]
+    climbed = target.step_noise(target.at(np.stack(places)))
+    likely = sorted(climbed, key=lambda one: -one.density)
+    reached = [mode.coordinates, *(one.coordinates for one in likely)]
+    return distinct(reached, mode.covariance, target.noise)[1:]
 
 
 def _exchanged_starts(posterior: Posterior, start_point: FloatArray) -> list[FloatArray]:

@@ -22,12 +22,22 @@ from bwbayes.inference.mode_finding import (
     refine,
     value_and_jacobian,
 )
+from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.state_space import Noise, powers
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Declaration, Distribution
 from tests.diagnosis.plants import bench
 from tests.diagnosis.test_fixes import CONFIG, put
 from tests.diagnosis.test_validation_end_to_end import made
 from tests.inference.linear import CASES, Linear, every_case
-from tests.inference.problems import short_posterior
+from tests.inference.problems import (
+    INTERVAL,
+    decaying_sine,
+    posterior_of,
+    ring_bender,
+    short_posterior,
+)
 from tests.prediction.runs import study_of
 
 MODELS = ("white", "discrepancy", "lag")
@@ -112,6 +122,57 @@ def test_both_modes_of_a_record_of_one_amplitude_are_seen(
         free, _ = study.posterior.prior.constrain(point.optima)
         np.testing.assert_allclose([0.71, 0.95], np.sort(free[:, 0]), atol=0.02)
         assert least < min(mode_weights(study.posterior, point)[1])
+
+
+PARTIAL = Distribution("uniform", {"lower": -1.0, "upper": 1.0})
+
+
+@dataclass(frozen=True)
+class Swaying(Noise):
+    """An autoregressive process of second order, by its partial autocorrelations p and q."""
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """Sds of sensor and process, and both autocorrelations."""
+        p, q = (
+            Declaration(name, "", name, "a partial autocorrelation", lambda _: PARTIAL)
+            for name in ("p", "q")
+        )
+        return (SENSOR_SD, DISCREPANCY_SD, p, q)
+
+    @property
+    def observe(self) -> FloatArray:
+        """The first state."""
+        return np.array([1.0, 0.0])
+
+    def stationary(self, theta: FloatArray) -> FloatArray:
+        """Return the autocovariances at lags zero and one."""
+        _, sd, p, _ = theta.T
+        rows = np.stack([np.ones_like(p), p, p, np.ones_like(p)], axis=-1)
+        covariance: FloatArray = sd[:, np.newaxis, np.newaxis] ** 2 * rows.reshape(-1, 2, 2)
+        return covariance
+
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return a power of the companion matrix."""
+        _, _, p, q = theta.T
+        matrices = np.zeros((len(theta), 2, 2))
+        matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0] = p * (1 - q), q, 1.0
+        return powers(matrices, readings)
+
+
+def test_noise_with_two_modes_has_the_better_one_whatever_the_seed() -> None:
+    """One explains readings beside an oscillation, the other all by a process without any.
+
+    They are dozens of nats apart, and prior draws around one lead to it only half of the time.
+    """
+    rng = np.random.default_rng(14)
+    process = lfilter([1.0], [1.0, -0.98 * 1.8, 0.8], rng.standard_normal(2100))[500:]
+    voltage, actuator = decaying_sine(1600), Actuator("none", "first", INTERVAL)
+    reading = ring_bender(actuator, "white", voltage, 2) + 1.5 * process / np.std(process)
+    reading += 0.5 * rng.standard_normal(1600)
+    posterior = posterior_of(voltage, reading, actuator, f"{__name__}:Swaying")
+    found = [fit(posterior, np.random.default_rng(seed)).log_density for seed in range(12)]
+    np.testing.assert_allclose(found, max(found), atol=0.05)
 
 
 def test_a_climb_along_which_hardly_anything_changes_comes_to_an_end(tmp_path: Path) -> None:
