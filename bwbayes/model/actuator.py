@@ -13,7 +13,7 @@ piece starts the next.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, get_args
@@ -22,7 +22,7 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values, check, normal
+from bwbayes.model.declaration import Declaration, Values, check, each_model, normal
 from bwbayes.model.inputs import Hold, Inputs, Span
 from bwbayes.model.linear import Creep, Filter, Sections
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
@@ -456,9 +456,3 @@ class Actuator:
         lags = self.creep.recursions(models, self.interval, self.hold)
         strengths = (column[name] for name in self.creep.names)
         return Sections((dynamics, *lags), (np.ones(models), *strengths))
-
-
-def each_model(column: Values) -> Iterator[dict[str, FloatArray]]:
-    """Yield the columns of one model after the other, (1,) each."""
-    for row in range(next(iter(column.values())).size):
-        yield {name: values[row : row + 1] for name, values in column.items()}

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -461,3 +461,9 @@ def round_to_scale(value: float, scale: float | None = None) -> float:
     if not size > 0:
         return value
     return round(value, 2 - math.floor(math.log10(size)))
+
+
+def each_model(column: Values) -> Iterator[dict[str, FloatArray]]:
+    """Yield the columns of one model after the other, (1,) each."""
+    for row in range(next(iter(column.values())).size):
+        yield {name: values[row : row + 1] for name, values in column.items()}

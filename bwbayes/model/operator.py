@@ -26,7 +26,7 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values, check
+from bwbayes.model.declaration import Declaration, Values, check, each_model
 from bwbayes.model.inputs import PIECE, Span, monotone_stretches
 from bwbayes.shown import brief
 
@@ -167,6 +167,29 @@ class Operator(ABC):
         (or in the state ``initial``, where that is a displacement). Otherwise ``initial`` says
         which of the reachable states it is.
         """
+
+    def begin_apart(
+        self,
+        column: Values,
+        step: HysteresisStep,
+        voltage: FloatArray,
+        span: Span,
+        *,
+        from_rest: bool,
+    ) -> FloatArray:
+        """Return the memory of the operator's ``step`` at first voltages (models,) of their own.
+
+        By default of one model after the other.
+        """
+        del step  # that of all models
+        return np.concatenate(
+            [
+                self.step(values).remembered(
+                    self.begin(values, float(first), span, from_rest=from_rest)
+                )
+                for values, first in zip(each_model(column), voltage, strict=True)
+            ]
+        )
 
     @abstractmethod
     def advance(self, column: Values, voltage: FloatArray, memory: Any) -> tuple[FloatArray, Any]:

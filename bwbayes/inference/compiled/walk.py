@@ -26,13 +26,12 @@ from bwbayes.inference.compiled.stages import (
     move_lanes,
     prepared,
 )
-from bwbayes.model.actuator import Actuator, each_model
+from bwbayes.model.actuator import Actuator
 from bwbayes.model.compiled import compiling
 from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import Inputs
-from bwbayes.model.operator import HysteresisStep, OneStateStep, Operator
-from bwbayes.model.operators.extremum_memory import RemembersExtrema
-from bwbayes.model.operators.scalar_memory import OneState, RelaxingStep
+from bwbayes.model.operator import HysteresisStep, Operator
+from bwbayes.model.operators.scalar_memory import RelaxingStep
 from bwbayes.model.stage import Stage, pass_stages
 
 
@@ -129,19 +128,11 @@ def _of_own(
     before = actuator.begin_inputs(column, inputs, from_rest=from_rest)
     first, _ = actuator.pass_inputs(column, inputs[:1], before)
     span = actuator.range_of(inputs.voltage)
-    step, memory = None, None
-    # Operators that remember extrema have another memory than their step.
-    if type(operator).step is not Operator.step and not isinstance(operator, RemembersExtrema):
-        step = operator.step(column)
-    if isinstance(operator, OneState) and isinstance(step, OneStateStep):
-        from_rest = from_rest or actuator.demagnetized
-        memory = operator.begin_apart(column, step, first[:, 0], from_rest=from_rest)
+    if type(operator).step is Operator.step:
+        step, memory = None, actuator.begin(column, first, from_rest=from_rest, span=span)
     else:
-        memory = actuator.begin(column, first, from_rest=from_rest, span=span)
-        if step is not None:
-            steps = (operator.step(values) for values in each_model(column))
-            remembered = [s.remembered(of_one) for s, of_one in zip(steps, memory, strict=True)]
-            memory = np.concatenate(remembered)
+        step, from_rest = operator.step(column), from_rest or actuator.demagnetized
+        memory = operator.begin_apart(column, step, first[:, 0], span, from_rest=from_rest)
 
     def advance(next_inputs: Inputs, memories: Any) -> tuple[FloatArray, Any]:
         before, memory = memories

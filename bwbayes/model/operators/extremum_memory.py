@@ -20,7 +20,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Distribution, Values, refuse
 from bwbayes.model.inputs import PIECE, Span, monotone_stretches
-from bwbayes.model.operator import Operator
+from bwbayes.model.operator import HysteresisStep, Operator
 
 INITIAL = Declaration(
     name="initial",
@@ -138,6 +138,27 @@ class RemembersExtrema(Operator):
             Extremum(float(np.max(turned)), at_turn, turned),
         )
         return Memory(voltage, here, -1.0, history)
+
+    def begin_apart(
+        self,
+        column: Values,
+        step: HysteresisStep,
+        voltage: FloatArray,
+        span: Span,
+        *,
+        from_rest: bool,
+    ) -> FloatArray:
+        """Return the memory of the operator's step at first voltages (models,) of their own.
+
+        The voltages have turned where :meth:`begin` says; a step goes from one turn to the next.
+        """
+        memory = step.demagnetized()
+        if not from_rest:
+            low, high = np.minimum(span.low, voltage), np.maximum(span.high, voltage)
+            turned = voltage + (column[INITIAL.name] + 1) / 2 * (high - voltage)
+            for turn in (high, low, turned):
+                memory = step.apply(memory, turn)[2]
+        return step.apply(memory, voltage)[2]
 
     def advance(
         self, column: Values, voltage: FloatArray, memory: Memory

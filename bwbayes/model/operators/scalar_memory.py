@@ -30,7 +30,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, anywhere, select
 from bwbayes.model.declaration import Context, Declaration, Distribution, Values, normal, positive
 from bwbayes.model.inputs import Span
-from bwbayes.model.operator import OneStateStep, Operator
+from bwbayes.model.operator import HysteresisStep, OneStateStep, Operator
 
 # Stands for an infinite ceiling, um.
 HIGHEST_CEILING = 1e9
@@ -90,9 +90,17 @@ class OneState(Operator):
         return StateMemory(voltage, state)
 
     def begin_apart(
-        self, column: Values, step: OneStateStep, voltage: FloatArray, *, from_rest: bool
+        self,
+        column: Values,
+        step: HysteresisStep,
+        voltage: FloatArray,
+        span: Span,
+        *,
+        from_rest: bool,
     ) -> FloatArray:
         """Return the memory of the operator's step at first voltages (models,) of their own."""
+        if not isinstance(step, OneStateStep):
+            return super().begin_apart(column, step, voltage, span, from_rest=from_rest)
         if not from_rest:
             return step.remembered(StateMemory(voltage, self.first_state(column, voltage)))
         at_zero = step.remembered(StateMemory(0.0, self.first_state(column, 0.0)))
