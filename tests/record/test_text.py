@@ -1,6 +1,7 @@
 """Text records: what is accepted, and one line for everything that is not."""
 
 import gzip
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -467,6 +468,7 @@ def test_empty_columns_are_none(
     blank=st.sampled_from(["", " "]),
     quote=st.sampled_from(["", '"']),
     comma=st.booleans(),
+    rule=st.booleans(),
     missing=st.sets(st.integers(0, 28), max_size=3),
 )
 def test_each_number_may_have_its_unit_behind_it(
@@ -476,6 +478,7 @@ def test_each_number_may_have_its_unit_behind_it(
     blank: str,
     quote: str,
     comma: bool,
+    rule: bool,
     missing: set[int],
 ) -> None:
     """Whatever separates them, with decimal points or commas, and where readings are missing."""
@@ -489,7 +492,11 @@ def test_each_number_may_have_its_unit_behind_it(
         cells = [cell.replace(".", ",") for cell in cells] if comma else cells
         mark = '"' if comma and separator == "," else quote
         rows.append(separator.join(f"{mark}{cell}{mark}" for cell in cells))
-    record = read(folder, lines("time,voltage,displacement".replace(",", separator), *rows))
+    head = ["time,voltage,displacement", *["---,:--,--:"] * rule]
+    text = lines(*(line.replace(",", separator) for line in head), *rows)
+    if rule and separator == "|":
+        text = re.sub(r"(?m)^(.*)$", r"|\1|", text.rstrip("\n"))
+    record = read(folder, text)
     good = read(folder, GOOD)
     assert record.interval == good.interval
     np.testing.assert_allclose(record.voltage, good.voltage, rtol=1e-12)

@@ -84,8 +84,10 @@ def without_units(lines: Sequence[str]) -> list[str]:
     separator, last = ways[0], split[ways[0]]
     cells = [[_WITH_UNIT.fullmatch(cell) for cell in cells_of(line, separator)] for line in lines]
     rows = {i: row for i, row in enumerate(cells) if len(row) == len(last) and all(row)}
-    first = min(rows, default=0)
-    names = cells_of(lines[first - 1], separator) if first else []
+    first = min(rows, default=0) - 1
+    while first > 0 and not re.search(r"\w", lines[first]):  # a rule below the names
+        first -= 1
+    names = cells_of(lines[first], separator) if first >= 0 else []
     columns = zip(*rows.values(), strict=True)
     units = [{cell[2] for cell in column if cell and cell[0]} for column in columns]
     if len(names) != len(last) or any(len(of_column) != 1 for of_column in units):
@@ -94,7 +96,7 @@ def without_units(lines: Sequence[str]) -> list[str]:
     named = [
         f"{name} ({unit})" if unit else name for name, (unit,) in zip(names, units, strict=True)
     ]
-    moved[first - 1] = separator.join(named)
+    moved[first] = separator.join(named)
     for index, row in rows.items():
         numbers = [cell[1] or "" for cell in row if cell]
         moved[index] = separator.join(

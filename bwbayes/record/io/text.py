@@ -2,14 +2,15 @@
 
 Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a comma, numbers may
 have decimal commas. The whole may be packed by gzip. The numbers are looked for, and the line above
-them names the columns; a second line may hold their units, or each number is followed by its own. Lines above the header are skipped with
-a remark, as are empty lines, comments and headers among the numbers, and words or a line that
-is cut off below them. Lines ``# key: value`` above them may hold ``voltage`` (command or output),
-``origin``, ``interval_s`` and ``time_offset_s``; a sampling rate or interval in any line above them
-counts as a guess. An empty cell or ``nan`` in the displacement is a missing reading. An error names
-the number of a line that cannot be read. The sheets of a workbook (``.xlsx``) are read as texts.
-LabVIEW's measurements (``.lvm``) have a header of their own, and one for each segment of rows, with
-the channels' units and clocks: :func:`plain_lvm` makes them the table that any other text is.
+them names the columns; a second line may hold their units, or each number is followed by its own.
+Lines above the header are skipped with a remark, as are empty lines, comments and headers among the
+numbers, and words or a line that is cut off below them. Lines ``# key: value`` above them may hold
+``voltage`` (command or output), ``origin``, ``interval_s`` and ``time_offset_s``; a sampling rate
+or interval in any line above them counts as a guess. An empty cell or ``nan`` in the displacement
+is a missing reading. An error names the number of a line that cannot be read. The sheets of a
+workbook (``.xlsx``) are read as texts. LabVIEW's measurements (``.lvm``) have a header of their
+own, and one for each segment of rows, with the channels' units and clocks: :func:`plain_lvm` makes
+them the table that any other text is.
 """
 
 from __future__ import annotations
