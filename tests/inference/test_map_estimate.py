@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from bwbayes.app.config.config import parse
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import Engine
+from bwbayes.inference import Engine, resolve_engine
 from bwbayes.inference.map_estimate import LeastSquares, MAPEstimate, fit, mode_weights
 from bwbayes.inference.mode_finding import (
     STEP,
@@ -163,7 +163,8 @@ class Swaying(Noise):
 def test_noise_with_two_modes_has_the_better_one_whatever_the_seed() -> None:
     """One explains readings beside an oscillation, the other all by a process without any.
 
-    They are dozens of nats apart, and prior draws around one lead to it only half of the time.
+    They are dozens of nats apart. One sample of the prior leads to the better one seven times in
+    twelve: with that alone, six seeds disagree 24 times in 25.
     """
     rng = np.random.default_rng(14)
     process = lfilter([1.0], [1.0, -0.98 * 1.8, 0.8], rng.standard_normal(2100))[500:]
@@ -171,7 +172,8 @@ def test_noise_with_two_modes_has_the_better_one_whatever_the_seed() -> None:
     reading = ring_bender(actuator, "white", voltage, 2) + 1.5 * process / np.std(process)
     reading += 0.5 * rng.standard_normal(1600)
     posterior = posterior_of(voltage, reading, actuator, f"{__name__}:Swaying")
-    found = [fit(posterior, np.random.default_rng(seed)).log_density for seed in range(12)]
+    posterior = replace(posterior, engine=resolve_engine())
+    found = [fit(posterior, np.random.default_rng(seed)).log_density for seed in range(6)]
     np.testing.assert_allclose(found, max(found), atol=0.05)
 
 

@@ -162,7 +162,10 @@ def _observed_first(stationary: FloatArray, observe: FloatArray) -> FloatArray:
         shared /= np.maximum(np.linalg.norm(shared, axis=1), np.finfo(float).tiny)[:, np.newaxis]
         other = np.stack([-shared[:, 1], shared[:, 0]], axis=1)
         size = np.einsum("mi,mij,mj->m", other, stationary, other)
-        ratio = (observe @ stationary @ observe) / np.maximum(size, np.finfo(float).tiny)
+        # States that are one and the same but for rounding have nothing of their own.
+        least = np.finfo(float).eps * np.trace(stationary, axis1=1, axis2=2)
+        size = np.maximum(size, least + np.finfo(float).tiny)
+        ratio = (observe @ stationary @ observe) / size
         turned[:, 1] = np.sqrt(ratio)[:, np.newaxis] * other
     return turned
 
