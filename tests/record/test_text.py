@@ -428,6 +428,9 @@ def test_too_few_readings_are_refused_and_none_are_a_plan(tmp_path: Path) -> Non
 def test_a_text_packed_by_gzip_is_the_text(tmp_path: Path) -> None:
     assert read(tmp_path, gzip.compress(GOOD.encode())).sha256 == read(tmp_path, GOOD).sha256
     assert "damaged" in fault(tmp_path, gzip.compress(GOOD.encode())[:-20])
+    with pytest.warns(InputWarning, match="1 line above the header skipped"):
+        titled = read(tmp_path, gzip.compress(b"PK 7, bench\n" + GOOD.encode()))
+    assert titled.sha256 == read(tmp_path, GOOD).sha256
 
 
 @quiet
@@ -584,6 +587,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
         ":1: what is the sampling rate, Hz (no column can be the time; with any other rate dyn",
     ),
     "empty file": ("", ": the file is empty"),
+    "one long number": (lines(*LINES, "9" * 200_000), ": a line of 200000 characters;"),
     "one long line": ('{"time": [' + "0.125, " * 30_000 + "0]}", ": a line of 210013 characters;"),
     "header alone": (HEADER, ": no columns of numbers in it"),
     "few samples": (lines(*LINES[:6]), ": too short, samples: 5"),

@@ -245,7 +245,7 @@ def _refuse_packed(path: Path) -> None:
     """
     with gzip.open(path) as file:
         begin = file.read(64).removeprefix(BOM_UTF8)
-    for mark in (b"\x89HDF", b"PK", *(file_format.mark for file_format in FORMATS)):
+    for mark in (b"\x89HDF", b"PK\x03\x04", *(file_format.mark for file_format in FORMATS)):
         if begin.startswith(mark):
             raise InputError(f"{path}: packed by gzip, which only plain text may be; unpack it")
 

@@ -82,10 +82,10 @@ def text_source(
     if text.startswith("LabVIEW Measurement"):
         text, clocks = plain_lvm(path, text)
     written = without_frame(text.split("\n"))
+    if (longest := max(map(len, written))) > csv.field_size_limit():
+        raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
     lines = without_units(_without_foot(written))
     is_whole |= len(lines) < len(written)
-    if (longest := max(map(len, lines))) > csv.field_size_limit():
-        raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
     tables = tables_of(lines)
     descriptions = described(tables, lines) if tables[1:] else ()
     chosen, _, shared = tables[index_of(path, [t.title for t in tables], table, descriptions)]
