@@ -264,7 +264,7 @@ def _zero_noise_starts(
 def _other_noise_starts(
     posterior: Posterior, mode: Mode, noise: FloatArray, generator: np.random.Generator
 ) -> FloatArray:
-    """Return starts (any, free) with a mode's displacement and other noise, if any is likely.
+    """Return starts (any, free) with a mode's displacement and other noise, the likeliest first.
 
     What prior draws (draws, noise) lead to depends on chance where the noise has several modes: so
     they are tried part by part.
