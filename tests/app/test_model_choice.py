@@ -24,7 +24,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.study.about import lines
 from bwbayes.app.study.resolve import resolve_config, with_noise
-from bwbayes.diagnosis.explanations import explain, likely_causes
+from bwbayes.diagnosis.explanations import explain, exponent, likely_causes
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import InputWarning
@@ -95,6 +95,18 @@ def test_a_run_adds_a_quadratic_gain_and_says_what_it_is_worth(tmp_path: Path) -
     again = bw.open_run(tmp_path / "run")
     assert again.config.model.stages == []
     assert again.config.model.nonlinearity == fit.config.model.nonlinearity
+
+
+def test_a_free_exponent_is_taken_while_the_noise_is_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It leaves stages and noise as they are, and states another prior."""
+    monkeypatch.setattr(explaining, "explain", lambda scene, *_: tuple(exponent(scene)))
+    chosen = choose_model(resolve_config(config_of("free exponent", tmp_path), tmp_path))
+    assert chosen.steps[0].startswith("added: transition of exponent ")
+    assert chosen.run.config.model.hysteresis == "bouc-wen"
+    assert chosen.run.config.parameters["exponent"].fixed is None
+    assert "exponent" in chosen.run.study.posterior.names
 
 
 @pytest.mark.slow

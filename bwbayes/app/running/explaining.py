@@ -197,7 +197,8 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
         models = [
             cause
             for cause in explanations
-            if cause.spec and not (is_open and _reopened(cause.spec) == open_run.study.spec)
+            if cause.spec
+            and not (is_open and not cause.stated and _reopened(cause.spec) == open_run.study.spec)
         ]
         parts = likely_causes([cause for cause in models if not cause.misleads])
         if needless:
