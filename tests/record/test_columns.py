@@ -335,7 +335,7 @@ def test_a_number_is_that_of_a_column_whatever_the_names_are(order: list[str]) -
         frame_source(frame, "a"),
         Naming(columns, {"time": "s", "voltage": "V", "displacement": "um"}),
     )
-    np.testing.assert_array_equal(table.columns["voltage"].values, VOLTAGE)
+    np.testing.assert_array_equal(table.values["voltage"], VOLTAGE)
     with pytest.raises(InputError, match=r"columns: displacement: 1.5 is no name and no number"):
         Naming({"displacement": 1.5})  # type: ignore[dict-item]
 

@@ -45,7 +45,7 @@ from bwbayes.record.io.recognition import (
     unit_of,
     with_own_times,
 )
-from bwbayes.record.io.series import Clock, Series, Source
+from bwbayes.record.io.series import Series, Source
 
 
 @dataclass(frozen=True)
@@ -180,34 +180,19 @@ class Naming:
 
 
 @dataclass(frozen=True)
-class FileColumn:
-    """A column as the file has it; its unit may have a factor, which may be negative."""
-
-    name: str
-    values: NDArray[Any]
-    unit: str
-    clock: Clock | None = None
-
-    def scaled(self, values: FloatArray, quantity: str) -> FloatArray:
-        """Convert values from this column's unit to the package's; without a unit, keep them."""
-        if not self.unit:
-            return values
-        factor, power = scale_of(self.unit, quantity) or (1.0, 0)
-        # Dividing by 1e3 rounds once, multiplying by the inexact 1e-3 would round twice.
-        return factor * (values * 10.0**power if power >= 0 else values / 10.0**-power)
-
-
-@dataclass(frozen=True)
 class ColumnTable:
     """The columns of a file by quantity ("time", "voltage", "displacement", "truth") or covariate.
 
-    ``notes`` are the notes in the file. ``naming`` finds the same columns again; without a time
-    column, the times come from its rate or from the source. ``rows`` are the indices of the file's
-    samples that are in the table, or None for all.
+    ``columns`` are the file's series, with the units that count; a unit may have a factor, which
+    may be negative. ``values`` are their numbers in these units. ``notes`` are the notes in the
+    file. ``naming`` finds the same columns again; without a time column, the times come from its
+    rate or from the source. ``rows`` are the indices of the file's samples that are in the table,
+    or None for all.
     """
 
     source: Source
-    columns: Mapping[str, FileColumn]
+    columns: Mapping[str, Series]
+    values: Mapping[str, NDArray[Any]]
     notes: Mapping[str, str]
     naming: Naming
     rows: IntArray | None = None
@@ -226,8 +211,17 @@ class ColumnTable:
 
     def only(self, rows: IntArray) -> ColumnTable:
         """Return the table of some of its rows."""
-        columns = {q: replace(c, values=c.values[rows]) for q, c in self.columns.items()}
-        return replace(self, columns=columns, rows=rows if self.rows is None else self.rows[rows])
+        values = {quantity: column[rows] for quantity, column in self.values.items()}
+        return replace(self, values=values, rows=rows if self.rows is None else self.rows[rows])
+
+    def convert(self, values: FloatArray, quantity: str) -> FloatArray:
+        """Convert values from a column's unit to the package's; without a unit, keep them."""
+        unit = self.columns[quantity].unit
+        if not unit:
+            return values
+        factor, power = scale_of(unit, quantity) or (1.0, 0)
+        # Dividing by 1e3 rounds once, multiplying by the inexact 1e-3 would round twice.
+        return factor * (values * 10.0**power if power >= 0 else values / 10.0**-power)
 
 
 def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
@@ -264,15 +258,10 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     if by_unit:
         reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
         _warn(f"{path}: taken by its unit: {reasons}; if not, say `columns`")
-    columns = {
-        quantity: FileColumn(
-            chosen[quantity].name,
-            chosen[quantity].numbers(path, readings=quantity == "displacement"),
-            unit,
-            chosen[quantity].clock,
-        )
-        for quantity, unit in units.items()
-        if unit
+    columns = {q: replace(chosen[q], unit=unit) for q, unit in units.items() if unit}
+    values = {
+        quantity: series.numbers(path, readings=quantity == "displacement")
+        for quantity, series in columns.items()
     }
     group = next(iter(chosen.values())).group
     notes = {**source.notes.get("", {}), **source.notes.get(group, {})}
@@ -281,7 +270,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
         covariates = {name: name for name in notes["covariates"].split(", ")}
     for name, column in covariates.items():
         series = series_named(source, column, name)
-        columns[name] = FileColumn(series.name, series.numbers(path), "", series.clock)
+        columns[name], values[name] = replace(series, unit=""), series.numbers(path)
     names = {q: column.name for q, column in columns.items()}
     has_clocks = "time" not in chosen and naming.fs is None
     others = [
@@ -298,7 +287,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
         q: name for q, name in names.items() if q in QUANTITIES and likeness(name, "", q) != 0
     }
     used = replace(as_asked, columns={**foreign, **as_asked.columns}, fs=naming.fs)
-    return ColumnTable(source, columns, notes, used, quantities=quantities)
+    return ColumnTable(source, columns, values, notes, used, quantities=quantities)
 
 
 def _warn(remark: str) -> None:

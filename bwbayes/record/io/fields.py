@@ -56,7 +56,7 @@ def record_fields(
     except InputError as error:
         raise table.error(str(error)) from error
     table, grid = _grid(table)
-    is_missing = np.isnan(table.columns["voltage"].values) & ("time" in table.columns)
+    is_missing = np.isnan(table.values["voltage"]) & ("time" in table.columns)
     is_missing[[0, -1] if grid.sources is None else grid.sources[[0, -1]]] = False
     if is_missing.any():
         rows = np.flatnonzero(~is_missing)
@@ -119,11 +119,12 @@ def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:
 
 
 def _check_lengths(table: ColumnTable) -> None:
-    (first, *_), others = table.columns, table.columns.items()
-    samples = table.columns[first].values.size
-    for quantity, column in others:
-        if column.values.size != samples:
-            problem = f"{column.values.size} values where {first} has {samples}"
+    first, *others = table.values
+    samples = table.values[first].size
+    for quantity in others:
+        size = table.values[quantity].size
+        if size != samples:
+            problem = f"{size} values where {first} has {samples}"
             raise table.error(f"{problem}; store one per sample", quantity)
     if samples < 2:
         raise table.error(f"too short, samples: {samples}; give at least {_MINIMUM_SAMPLES}")
@@ -131,7 +132,7 @@ def _check_lengths(table: ColumnTable) -> None:
 
 def _without_empty_ends(table: ColumnTable) -> ColumnTable:
     """Return the table without rows at its ends that have nothing but a time."""
-    columns = [column.values for name, column in table.columns.items() if name != "time"]
+    columns = [values for name, values in table.values.items() if name != "time"]
     filled = np.flatnonzero(np.any([~np.isnan(values) for values in columns], axis=0))
     if not filled.size or filled[-1] + 1 - filled[0] == columns[0].size:
         return table
@@ -148,8 +149,8 @@ def _without_marks(table: ColumnTable) -> ColumnTable:
     A finite mark is a repeated number that is farther from all other readings than these are from
     each other, mostly at voltages within the range at which the others were read.
     """
-    column, voltage = table.columns["displacement"], table.columns["voltage"].values
-    readings = np.array(column.values, dtype=np.float64)
+    voltage = table.values["voltage"]
+    readings = np.array(table.values["displacement"], dtype=np.float64)
     is_finite = np.isfinite(readings)
     if (is_infinite := np.isinf(readings)).any():
         count = int(np.count_nonzero(is_infinite))
@@ -176,8 +177,7 @@ def _without_marks(table: ColumnTable) -> ColumnTable:
         warnings.warn(str(table.error(remark, "displacement", sample)), InputWarning, stacklevel=4)
         readings[is_mark] = np.nan
         is_finite = is_other
-    columns = {**table.columns, "displacement": replace(column, values=readings)}
-    return replace(table, columns=columns)
+    return replace(table, values={**table.values, "displacement": readings})
 
 
 def _check_moving(table: ColumnTable, quantity: str, values: FloatArray) -> None:
@@ -192,18 +192,18 @@ def _check_moving(table: ColumnTable, quantity: str, values: FloatArray) -> None
 
 def _converted(table: ColumnTable, quantity: str) -> FloatArray:
     """Convert a column to the package's unit; refuse numbers not finite or absurdly large."""
-    column = table.columns[quantity]
+    column = table.values[quantity]
     largest = 1e12 if quantity == "time" else 1e9  # s; V or um, whatever the actuator
     if not table.quantities.are_default and quantity != "time":
         largest = 1e100
     with np.errstate(all="ignore"):
-        values = column.scaled(np.asarray(column.values, dtype=np.float64), quantity)
+        values = table.convert(np.asarray(column, dtype=np.float64), quantity)
         refused = ~(np.abs(values) <= largest)
     if quantity == "displacement":
         refused &= ~np.isnan(values)
     if refused.any():
         sample = int(np.argmax(refused))
-        raw = column.values[sample]
+        raw = column[sample]
         problem = f"{raw:g} is absurdly large; check the unit in the column's name"
         if not np.isfinite(raw):
             fact = "no number (empty or nan)" if np.isnan(raw) else f"{raw} is not a finite number"
@@ -215,10 +215,10 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
 def _grid(table: ColumnTable) -> tuple[ColumnTable, Grid]:
     if "time" in table.columns:
         return time_grid(table, _converted(table, "time"))
-    column = next(iter(table.columns.values()))
+    name, column = next(iter(table.columns.items()))
     stated, start, _ = column.clock or Clock(0.0)
     interval = 1 / table.naming.fs if table.naming.fs else stated
-    require_plausible(table, interval, column.values.size)
+    require_plausible(table, interval, table.values[name].size)
     return table, Grid(start, interval)
 
 
@@ -302,10 +302,11 @@ def align_clocks(table: ColumnTable) -> ColumnTable:
     if not (voltage.clock and displacement.clock):
         return table
     interval, delay = voltage.clock.interval, displacement.clock.delay(voltage.clock)
+    driven, read = table.values["voltage"], table.values["displacement"]
     # Times of the readings and the places of the nearest voltages, in samples of the voltage.
     ratio = displacement.clock.interval / interval
-    times = delay / interval + ratio * np.arange(displacement.values.size, dtype=np.float64)
-    samples = np.arange(voltage.values.size)
+    times = delay / interval + ratio * np.arange(read.size, dtype=np.float64)
+    samples = np.arange(driven.size)
     if times.size == samples.size and np.abs(times - samples).max() <= 0.01:
         return table
     # Slightly more than a half, so that rounding decides nothing halfway between two.
@@ -340,14 +341,15 @@ def align_clocks(table: ColumnTable) -> ColumnTable:
     remark = str(table.error(", ".join(facts), "displacement"))
     warnings.warn(remark, InputWarning, stacklevel=4)
     clock = voltage.clock._replace(start=grid.start)
-    rows = slice(first, last + 1)
     columns = {
-        "voltage": replace(voltage, values=voltage.values[rows], clock=clock),
-        "displacement": replace(
-            displacement, values=grid.filled(displacement.values.astype(np.float64)), clock=clock
-        ),
+        "voltage": replace(voltage, clock=clock),
+        "displacement": replace(displacement, clock=clock),
     }
-    return replace(table, columns=columns, rows=np.arange(first, last + 1))
+    values = {
+        "voltage": driven[first : last + 1],
+        "displacement": grid.filled(read.astype(np.float64)),
+    }
+    return replace(table, columns=columns, values=values, rows=np.arange(first, last + 1))
 
 
 def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
@@ -401,28 +403,32 @@ def _own(source: Source, naming: Naming, quantity: str) -> Naming:
 
 def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> ColumnTable:
     path, other = voltage.source.path, displacement.source.path
-    reading = displacement.columns["displacement"]
-    columns = {q: c for q, c in voltage.columns.items() if q not in ("displacement", "truth")}
-    samples, readings = columns["voltage"].values.size, reading.values.size
+    reading, read = displacement.columns["displacement"], displacement.values["displacement"]
+    kept = [q for q in voltage.columns if q not in ("displacement", "truth")]
+    columns = {quantity: voltage.columns[quantity] for quantity in kept}
+    values = {quantity: voltage.values[quantity] for quantity in kept}
+    samples, readings = values["voltage"].size, read.size
     if samples != readings and reading.clock is None:
         raise InputError(
             f"{other}: {readings} displacements for {samples} voltages in {path}; give files of "
             "the same samples"
         )
     if "time" in displacement.columns:
-        column = displacement.columns["time"]
+        name = displacement.columns["time"].name
+        timed = voltage if "time" in columns else displacement
         reading_times, times = (
-            c.scaled(c.values, "time") for c in (column, columns.get("time", column))
+            table.convert(table.values["time"], "time") for table in (displacement, timed)
         )
         apart = np.abs(reading_times - times) > 0.01 * np.ptp(reading_times) / reading_times.size
         if apart.any():
             sample = int(np.argmax(apart))
             raise InputError(
-                f"{other}: {column.name}: sample {sample} is at {reading_times[sample]:.9g} s, "
+                f"{other}: {name}: sample {sample} is at {reading_times[sample]:.9g} s, "
                 f"in {path} at {times[sample]:.9g} s; give both at the same times, or `fs=HZ` for "
                 "the times"
             )
-        columns["time"] = columns.get("time", column)
+        columns["time"], values["time"] = timed.columns["time"], timed.values["time"]
+    values["displacement"] = read
     columns["displacement"] = replace(reading, name=f"{other.name}: {reading.name}")
     used = {q: c for q, c in voltage.naming.columns.items() if q != "displacement"}
     if "displacement" in naming.columns:
@@ -431,6 +437,7 @@ def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> 
     return ColumnTable(
         replace(voltage.source, lines=voltage.source.lines if alike else ()),
         columns,
+        values,
         {"origin": path_text(f"{path.name}, {other.name}"), **voltage.notes},
         replace(naming, columns=used, fs=voltage.naming.fs),
         quantities=voltage.quantities,

@@ -85,12 +85,12 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
     Raises InputError: times are repeated too often or go back, or a gap makes the record too long.
     Warns InputWarning: if samples are missing, or times are repeated or not uniform.
     """
-    column = table.columns["time"]
-    is_float = column.values.dtype.kind == "f"
-    raw = column.values if is_float else column.values.astype(np.int64)
+    column = table.values["time"]
+    is_float = column.dtype.kind == "f"
+    raw = column if is_float else column.astype(np.int64)
     # Count from the first time, so that a clock's times lose no digits. A time above 1e6 s is that
     # of a clock, not of a measurement that counts from its start: the record's times leave it out.
-    elapsed = column.scaled((raw - raw[0]).astype(np.float64), "time")
+    elapsed = table.convert((raw - raw[0]).astype(np.float64), "time")
     start = float(stamps[0])
     offset = start if abs(start) > 1e6 else 0.0
     steps, samples = np.diff(elapsed), np.arange(elapsed.size)
@@ -111,12 +111,12 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
         raise table.error(problem, "time")
     require_plausible(table, interval, elapsed.size)
     # Rounding error of a number of the time column in memory, s.
-    unit = np.spacing(np.abs(column.values).max()) if is_float else 0.0
-    rounding = float(column.scaled(np.array(unit, dtype=np.float64), "time"))
+    unit = np.spacing(np.abs(column).max()) if is_float else 0.0
+    rounding = float(table.convert(np.array(unit, dtype=np.float64), "time"))
     is_repeat = np.append(False, steps == 0)
     is_copy = is_repeat.copy()
-    for name in table.columns:
-        before, after = table.columns[name].values[:-1], table.columns[name].values[1:]
+    for values in table.values.values():
+        before, after = values[:-1], values[1:]
         is_copy[1:] &= (after == before) | (np.isnan(after) & np.isnan(before))
     # A coarse clock repeats times, but not all other columns with them.
     if is_copy.any() and (is_copy == is_repeat).all():
@@ -214,11 +214,11 @@ def _uniform_interval(
 
 def _stated_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArray) -> float | None:
     """Return the interval, s, of a file's stated rate, if all printed times agree, or None."""
-    column, rate = table.columns["time"], table.source.stated_rate()
-    half = _half_units(np.asarray(column.values, dtype=np.float64))
+    rate = table.source.stated_rate()
+    half = _half_units(np.asarray(table.values["time"], dtype=np.float64))
     if not rate or half is None or "interval_s" in table.notes:
         return None
-    half = column.scaled(half, "time")
+    half = table.convert(half, "time")
     # A time halfway between two digits is rounded by just half a unit, and by the last bits.
     is_on_it = np.abs(elapsed - positions / rate) <= 1.000001 * (half + half[0])
     return 1 / rate if is_on_it.all() else None
@@ -232,12 +232,11 @@ def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArr
     units are longer than 0.8 intervals, early ones have to be short, as coarse times alone would
     hide missing samples.
     """
-    column = table.columns["time"]
-    half = _half_units(np.asarray(column.values, dtype=np.float64))
+    half = _half_units(np.asarray(table.values["time"], dtype=np.float64))
     if half is None:
         return None
     steps, interval = int(positions[-1]), float(elapsed[-1] / positions[-1])
-    half = np.maximum(column.scaled(half, "time"), 0.01 * interval)
+    half = np.maximum(table.convert(half, "time"), 0.01 * interval)
     is_even = steps == elapsed.size - 1
     if half.max() > 0.4 * interval and not (
         is_even and np.count_nonzero(half <= 0.1 * interval) >= 10
