@@ -56,8 +56,8 @@ class NoNumbersError(InputError):
 class ColumnsError(InputError):
     """Columns or units of a file that are not known; ``columns`` and ``units`` are a guess.
 
-    So is ``fs``, the sampling rate, Hz, if no column can be the time. What cannot be guessed is a
-    word, ``"HZ"``, or a question mark, which are refused.
+    So is ``fs``, the sampling rate, Hz, if no column can be the time. A word, ``"HZ"``, or a
+    question mark, which are refused, stand for parts that cannot be guessed.
 
     The text says what to write in Python; :meth:`in_config` and :meth:`in_command` what to write
     elsewhere. ``place`` is the table of the config that names the file.

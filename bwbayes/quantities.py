@@ -1,4 +1,4 @@
-"""What goes into a specimen and comes out: by default a voltage in V and a displacement in um.
+"""Input and output of a specimen: by default a voltage in V and a displacement in um.
 
 The package computes in the units of the record, whatever they are, and its words are written once,
 for voltage and displacement in V and um. :class:`Quantities` say them in a record's own words where
@@ -50,8 +50,8 @@ DISPLACEMENT = Quantity("displacement", "um")
 TIME = Quantity("time", "s")
 
 
-# What of the package's texts depends on the quantities. A word may be a part of a path, an option
-# or an identifier, which it is not; a V may be of a person's name.
+# The words of the package's texts that depend on the quantities. A word in a path, an option or an
+# identifier is none of them; a V may be of a person's name.
 _WORDS = re.compile(
     r"(?<![\w./='\"\\-])(?P<word>[Vv]oltages?|[Dd]isplacements?)(?![\w/]|[.=-]\w)"
     r"|(?P<zero>\bzero volts?\b)|(?P<slope>\bpiezoelectric coefficient\b)"
@@ -59,7 +59,7 @@ _WORDS = re.compile(
     r"|(?P<before>/?)(?<![\w.\\])(?<![A-Z]\. )"
     r"(?P<unit>um|µm|V|volts?|micrometers?)(?!\w)(?P<after>\^?)"
 )
-# What stands for a time where samples are the clock.
+# Words for a time where samples are the clock.
 _SAMPLES = {
     "time (s)": "sample",
     "(s)": "(samples)",
@@ -119,7 +119,7 @@ class Quantities:
 
     @cached_property
     def by_key(self) -> dict[str, str]:
-        """What the package calls the quantities, by the other names that a user may give them."""
+        """The package's names of the quantities, by the other names that a user may give them."""
         names = {"input": "voltage", self.input.name.casefold(): "voltage"}
         return names | {"output": "displacement", self.output.name.casefold(): "displacement"}
 

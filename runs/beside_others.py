@@ -1,4 +1,4 @@
-"""What a band is worth beside what is commonly used, on one record of a measured piezo stack.
+"""A band against those of common methods, on one record of a measured piezo stack.
 
 The same eleven seconds are fitted by four methods, and each predicts the other part of the record:
 large loops, as they were fitted, and a decay to rest with a hold, which were not.

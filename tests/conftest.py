@@ -1,4 +1,4 @@
-"""What all tests share: twenty examples, no deadline, and in CI the same examples each time.
+"""Settings of all tests: twenty examples, no deadline, and in CI the same examples each time.
 
 Elsewhere hypothesis looks for new ones in every run, and keeps those that fail for the next.
 The tests of the whole come first: they take longest, and no worker shall end with one alone. Before

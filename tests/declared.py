@@ -1,4 +1,4 @@
-"""What the parts of the model declare, by parameter name, for tests that put models together."""
+"""Declarations of the model's parts, by parameter name, for tests that put models together."""
 
 from dataclasses import replace
 

@@ -31,14 +31,14 @@ from tests.app.specimens import CONFIG, record as specimen, specimens
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
-# What a config of a reader may say, so that it takes seconds.
+# Keys added to a reader's config, so that it takes seconds.
 QUICK = "\n[sampling]\ness = 200\nblock = 25\nwalkers = 32\n"
 
-# What the small config of a campaign says beside, to be a reader's own.
+# Keys added to the small config of a campaign, to be a reader's own.
 RECORD = '[record]\nfile = "my_record.csv"\ntrain = [[0.0, 2.0]]'
 HELD_OUT = "\n[validation.held_out]\nwindow = [2.0, 2.5]\n"
 
-# What takes minutes or hours, and what is run in its place; the rest of a line is as it is shown.
+# Words that take minutes or hours, and those run in their place; the rest of a line is as shown.
 SHORTER = {
     "--replicates 500": "--replicates 2",
     "--replicates 1000": "--replicates 2",
@@ -196,7 +196,7 @@ def typed(line: str) -> str:
     assert done.exception is None, f"{line}: {done.exception!r} {done.output}"
     assert 0 == done.return_value, f"{line}: {done.output}"
     assert done.output
-    # What is finished stays as it is when it is resumed.
+    # A finished run stays as it is when it is resumed.
     left = {
         str(path)
         for path, state in _changes().items()

@@ -17,7 +17,7 @@ REQUIRED = "required"
 
 @dataclass(frozen=True)
 class Program:
-    """What the program may be called, and the Debian packages that have it."""
+    """Names that the program may have, and the Debian packages with it."""
 
     names: tuple[str, ...]
     packages: tuple[str, ...]

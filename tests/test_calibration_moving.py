@@ -1,4 +1,4 @@
-"""What people run is calibrated: default priors, records that start in motion, other records.
+"""Ordinary runs are calibrated: default priors, records that start in motion, other records.
 
 The default priors are resolved once, from a typical record of a ring bender that is cut out of a
 running drive, as the package does with a user's file; then the replicates draw ten or eleven
@@ -96,7 +96,7 @@ exponent = { prior = { distribution = "lognormal", median = 1.5, sigma = 0.3 } }
 
 
 class Variant(NamedTuple):
-    """What is calibrated: the dynamics, the priors that are not defaults, and what it takes."""
+    """A setting to calibrate: the dynamics, the priors that are not defaults, and what it takes."""
 
     dynamics: str
     parameters: str = ""

@@ -1,4 +1,4 @@
-"""What CONTRIBUTING shows is run as it stands there."""
+"""The examples of CONTRIBUTING are run as they stand there."""
 
 import json
 import os

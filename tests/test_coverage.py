@@ -33,7 +33,7 @@ LIMIT = 3.0
 
 @dataclass(frozen=True)
 class Replicate:
-    """What one seed gave: where the truth lies in each posterior, and the verification's bands."""
+    """Result of one seed: where the truth lies in each posterior, and the verification's bands."""
 
     ranks: FloatArray
     bands: Bands

@@ -1,8 +1,8 @@
 """Every example that people are shown is run: in README, help texts and notebooks.
 
-They are collected from these texts, so that a new one is run by itself. What the README does in
-Python is in ``test_readme.py``, docstrings are run by ``test_public_names.py``, and the notebooks'
-cells by ``test_examples.py``. Each command is run once; ``-m slow`` runs every line and config.
+They are collected from these texts, so that a new one is run by itself. The README's Python is in
+``test_readme.py``, docstrings are run by ``test_public_names.py``, and the notebooks' cells by
+``test_examples.py``. Each command is run once; ``-m slow`` runs every line and config.
 """
 
 import os
@@ -38,10 +38,10 @@ COMMANDS = [line for line in SHOWN if line.startswith("bwbayes ")]
 # With words in capitals for what a reader fills in.
 PATTERNS = [line for line in COMMANDS if re.search(r" [A-Z]+\b(?!:)", line)]
 
-# What the README shows of a first record goes from one line to the next.
+# The README's first record goes from one line to the next.
 FIRST = [line.partition("#")[0].strip() for line in blocks("sh")[2].splitlines()]
 
-# What is not run here, and where it is.
+# Lines that are not run here, and where they are.
 ELSEWHERE = {
     "python3 -m venv": "the fixture `summary` of test_readme.py; pip in test_packaging.py",
     "dask ": "app/test_executors.py",

@@ -213,7 +213,7 @@ Judged = tuple[float, float, float]
 def judged(bands: list[Bands]) -> Judged:
     """Judge bands where their lead-in has ended, the error by the range of the whole record.
 
-    What is left of one that decays after its lead-in may have little range.
+    The rest of one that decays may have little range after its lead-in.
     """
     covered, nrmse, width = [], [], []
     for one in bands:

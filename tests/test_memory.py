@@ -18,7 +18,7 @@ from tests.sampling.samplings import PLAN, POSTERIOR, run
 
 on_linux = pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's /proc")
 
-# Not ru_maxrss, which a process takes over from the one that starts it.
+# This is not ru_maxrss, which a process takes over from the one that starts it.
 LARGEST = """
 from pathlib import Path
 status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
@@ -105,7 +105,7 @@ assert np.isfinite(block.log_density).all()
     ],
 )
 def test_million_samples_take_less_than_a_gibibyte(engine: Engine, samples: int) -> None:
-    """Of a process that moves 64 walkers a step."""
+    """The peak of a process that moves 64 walkers a step."""
     assert peak(ONE_STEP.format(engine=engine, samples=samples)) < 2**30
 
 

@@ -220,8 +220,8 @@ def test_an_operator_from_outside_goes_all_the_way(
 ) -> None:
     """Resolved, fitted, sampled, predicted, reported and opened; the truth is within four sds.
 
-    The noise is from outside, too; what a run has kept of it is read again.
-    Of three parameters, such a bound is missed by chance in one of 5,000 runs.
+    The noise is from outside, too; what a run has kept of it is read again. With three parameters,
+    such a bound is missed by chance in one of 5,000 runs.
     """
     kind = TANH_LOOP
     small.without_pictures(monkeypatch)
@@ -247,7 +247,7 @@ def test_an_operator_from_outside_goes_all_the_way(
 @pytest.mark.usefixtures("_my_operator")
 @pytest.mark.parametrize("kind", list(TRUTH))
 def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
-    """Of a problem whose truth may be stated in the operator's own parameters."""
+    """The truth may be stated in the operator's own parameters."""
     stated = config(tmp_path, kind).model_copy(update={"truth": TRUTH[kind]})
     posterior = resolve_config(stated, tmp_path).study.posterior
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))

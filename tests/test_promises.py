@@ -1,8 +1,8 @@
 """The figures that ``tests/README.md`` quotes are those measured when the slow tests last ran.
 
 A row is found by its claim. The column of figures holds those of the study, in their order, as
-precisely as they are printed, and no others. Of limits and records, those that a study says are
-checked too; the rest of them are numbers that the tests themselves hold.
+precisely as they are printed, and no others. The limits and records that a study states are checked
+too; the others are numbers that the tests themselves hold.
 """
 
 from pathlib import Path

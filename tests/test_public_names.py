@@ -1,4 +1,4 @@
-"""What `import bwbayes` offers, and what people and tools look for: names, docstrings, errors."""
+"""Public names, and what people and tools look for: docstrings, errors, metadata."""
 
 import ast
 import doctest
@@ -29,7 +29,7 @@ HELP = (
     "from bwbayes.app.commands.cli import cli; cli(['--help'], standalone_mode=False); "
     "cli(['run', '--help'], standalone_mode=False)"
 )
-# What reads a command line is all that help loads.
+# Help loads no more than reads a command line.
 HEAVY = {"arviz", "emcee", "h5py", "matplotlib", "numba", "pandas", "pydantic", "xarray"}
 
 
@@ -98,7 +98,7 @@ def test_the_docstrings_example_runs() -> None:
     assert (2, 2000) == getattr(names["h"], "shape", None)
 
 
-# What people and tools look for: how to cite and contribute, shell completion, docstrings
+# People and tools find what they look for: how to cite and contribute, shell completion, docstrings
 
 ROOT = Path(__file__).parents[1]
 MODULES = {module.__name__: module for module in every_module()}

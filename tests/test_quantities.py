@@ -217,7 +217,7 @@ def test_no_default_prior_knows_an_absolute_voltage_or_displacement(exponent: fl
 
 
 def test_a_loop_without_time_is_rate_independent_and_says_so() -> None:
-    """Whatever the model says of dynamics, creep and noise; with a time they stay."""
+    """Its dynamics, creep and noise are left out; with a time they stay."""
     h, b = loop()
     stated: dict[str, Any] = {"input": "H (A/m)", "output": "B (T)"}
     keys = {"dynamics": "lag", "creep": True, "stages": ["backlash", "sensor-lag"]}

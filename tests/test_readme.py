@@ -145,7 +145,7 @@ def test_the_quoted_campaign_is_that_of_the_last_benchmark() -> None:
 
 
 def test_the_quoted_evaluations_of_an_effective_draw_are_those_of_the_run(summary: Any) -> None:
-    """Of the draws that count, within a fifth: effective draws are estimates."""
+    """As many draws as stated, within a fifth: effective draws are estimates."""
     quoted = re.search(r"One costs \*\*([\d.]+)\*\* simulations", " ".join(README.split()))
     assert quoted
     least = min(min(row["ess_bulk"], row["ess_tail"]) for row in summary["parameters"].values())

@@ -33,7 +33,7 @@ from tests.reference.plain import FOLDER, MEASURED, Case, load_case, log_likelih
 from tests.sampled import sampled
 from tests.together import WrongCorrelation
 
-# What a run may be off by: in sds, in parts, in sds.
+# Largest errors of a run: in sds, in parts, in sds.
 LIMITS = {"mean": 0.1, "sd": 0.05, "quantile_5": 0.15, "quantile_95": 0.15}
 
 ESS = 5000

@@ -2,8 +2,8 @@
 
 Bouc-Wen hysteresis, with the noise that has most evidence, is fitted to 4 s of each plant at 5 kHz,
 with every reading, every 5th, 25th and 100th (the drive stays whole), and predicts another record
-of it. What the model misses is smooth and the same at all rates, so that fewer readings must not
-tell more: a rough discrepancy, an Ornstein-Uhlenbeck process, is the twin.
+of it. The model's error is smooth and the same at all rates, so that fewer readings must not tell
+more: a rough discrepancy, an Ornstein-Uhlenbeck process, is the twin.
 """
 
 from collections import Counter

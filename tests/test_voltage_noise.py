@@ -45,8 +45,8 @@ class Answer:
     def right(self, clean: "Answer") -> bool:
         """Whether it is what is asked for, beside that of the ``clean`` voltage.
 
-        Of d, alpha and beta 2%, of gamma 10%, or three sds; 88 to 99% of the next record covered,
-        by bands that are at most 1.5 times as wide.
+        Largest errors: 2% of d, alpha and beta, 10% of gamma, or three sds; 88 to 99% of the next
+        record covered, by bands that are at most 1.5 times as wide.
         """
         near = np.abs(self.error) < np.array([0.02, 0.02, 0.02, 0.1])
         known = np.all(near | (np.abs(self.z) < 3))
@@ -150,7 +150,7 @@ def test_one_noisy_record_is_right_and_as_measured_it_is_not(tmp_path: Path) -> 
     assert not answer(raw[0], raw[1], tmp_path).right(clean)
 
 
-# What an estimated voltage leaves unsure of the parameters, against fits along other estimates
+# Uncertainty of the parameters from an estimated voltage, against fits along other estimates
 
 
 def test_newton_steps_are_what_fits_along_other_paths_move(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""What a drive tells of an actuator and a fit costs; a few periods of a steady sine are enough.
+"""A drive's information on an actuator, and its cost; few periods of a steady sine are enough.
 
 The virtual test stand without a discrepancy, its sensor's noise 0.5 um of a range of 120, default
 priors, at 10 Hz (100 readings) and at 1 kHz (10,000). A slow study keeps its figures; README's
@@ -137,8 +137,8 @@ def test_a_steady_sine_converges_within_hundreds_of_steps(seed: int, tmp_path: P
 def test_forty_steady_sines_converge_and_their_intervals_cover(tmp_path: Path) -> None:
     """All converge within two minutes; each parameter's 95% interval covers 33 times or more.
 
-    Of intervals that cover 95% that is missed once in 1,000 by one parameter, once in 100 by one
-    of eight; of those that cover 70% it is missed in 94 of 100.
+    If intervals cover 95%, that is missed once in 1,000 by one parameter, once in 100 by one of
+    eight; if they cover 70%, it is missed in 94 of 100.
     """
     both = np.zeros((2, RECORDS, len(PHYSICAL)))
     steps, seconds = [], []

@@ -169,7 +169,7 @@ class Design(Product, Sequence[DesignScore]):
 
     @property
     def chosen(self) -> dict[str, tuple[str, DesignScore]]:
-        """What to measure: a title and a candidate, by the name of the signal's file."""
+        """The signals to measure: a title and a candidate, by the name of the signal's file."""
         return {"best": ("The best signal", self.best)}
 
     def records(self) -> dict[str, Record]:
@@ -323,7 +323,7 @@ class RivalDesign(Design):
 
     @property
     def chosen(self) -> dict[str, tuple[str, DesignScore]]:
-        """What to measure: a title and a candidate, by the name of the signal's file."""
+        """The signals to measure: a title and a candidate, by the name of the signal's file."""
         return {
             "validate": ("Validation record", self.validation),
             "train": ("Training record", self.training),

@@ -266,8 +266,8 @@ def _other_noise_starts(
 ) -> FloatArray:
     """Return starts (any, free) with a mode's displacement and other noise, the likeliest first.
 
-    What prior draws (draws, noise) lead to depends on chance where the noise has several modes: so
-    they are tried part by part.
+    Where the noise has several modes, it depends on chance to which of them prior draws
+    (draws, noise) lead: so they are tried part by part.
     """
     target = Target(posterior)
     places = [

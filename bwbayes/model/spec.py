@@ -72,8 +72,8 @@ class ModelSpec:
     hold
         Course of the voltage between samples; ``"auto"`` takes it from the record.
     history
-        What the hysteresis has been through before a record: ``"unknown"``, any drive over the
-        voltages of the record, or ``"demagnetized"``, a voltage straight from 0 V.
+        The drive before a record: ``"unknown"``, any over the voltages of the record, or
+        ``"demagnetized"``, a voltage straight from 0 V.
     noise
         The model of the residual.
 

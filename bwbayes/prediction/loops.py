@@ -453,7 +453,7 @@ def measure_step(
             np.exp(first_passage(np.log(time), share, fraction)) for fraction in (0.1, 0.9)
         )
         estimates["rise_s"] = Estimate.of(end - begin)
-        # What rounding makes of a response that only rises is no overshoot.
+        # A response that only rises has no overshoot, but for rounding.
         overshoot = np.round(100 * np.maximum(np.max(share, axis=1) - 1, 0.0), 9)
         estimates["overshoot_percent"] = Estimate.of(overshoot)
     crept = None

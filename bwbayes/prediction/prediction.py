@@ -121,7 +121,7 @@ def predict_windows(
     """
     theta = posterior.prior.theta(draws)
     if record.displacement is not None:
-        # What no fit has followed says nothing of it.
+        # A reading that was not fitted says nothing of the fit.
         left_out = np.isnan(posterior.single_record.displacement)
         record = replace(record, displacement=np.where(left_out, np.nan, record.displacement))
     start_states = training_initial_states(posterior, theta, generator)

@@ -44,8 +44,8 @@ class PolynomialMap:
 
         zⱼ = (uⱼ − Σₜ bₜⱼ Π c) exp(−Σ_{i < j} sᵢⱼ cᵢ),
 
-    where the product of term t is of up to four cᵢ with i < j. What a record determines well is a
-    smooth function of the parameters, of which this is the Taylor series.
+    where the product of term t is of up to four cᵢ with i < j. A record determines a smooth
+    function of the parameters well, of which this is the Taylor series.
 
     Parameters
     ----------

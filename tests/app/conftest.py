@@ -1,4 +1,4 @@
-"""What the tests of the app share: the small run, and a copy of it to change."""
+"""Fixtures of the app's tests: the small run, and a copy of it to change."""
 
 import re
 import shutil
@@ -43,7 +43,7 @@ def _without_explanations(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @dataclass(frozen=True)
 class Said:
-    """What a command said, and its exit status."""
+    """A command's output and its exit status."""
 
     status: int
     out: str

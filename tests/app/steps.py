@@ -1,4 +1,4 @@
-"""What a person is told of the steps of a job: their names, and what share of each is done."""
+"""The progress of a job as it is shown: names of its steps, and what share of each is done."""
 
 import pytest
 

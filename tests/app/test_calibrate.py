@@ -317,7 +317,7 @@ def test_what_no_replicate_can_use_leaves_no_folder(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 def test_intervals_of_a_run_are_right_for_its_record() -> None:
-    """Of 300 readings of the stand, in 200 replicates; of the mean over parameters the error is 1%.
+    """For 300 readings of the stand, in 200 replicates; their mean has an error of 1%.
 
     Parameters share their record, and so most of what luck does in it.
     """

@@ -268,7 +268,7 @@ def test_another_config_or_folder_is_refused(given: Path, whole: Path, tmp_path:
 def test_python_has_table_population_and_the_next_specimen(
     given: Path, whole: Path, tmp_path: Path
 ) -> None:
-    """Of a campaign that is there; it warns of what is short."""
+    """It is read from a campaign's folder; it warns of what is short."""
     shutil.copytree(whole, tmp_path / "batch")
     with pytest.warns(InputWarning) as warned:
         campaign = bw.campaign(

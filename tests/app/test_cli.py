@@ -99,7 +99,7 @@ def test_wrong_command_line_is_one_line(
 @pytest.mark.parametrize(
     ("config", "record", "texts"),
     [
-        # Of each kind one; tests/record and test_config.py have them all.
+        # One of each kind; tests/record and test_config.py have them all.
         (RECORD, [*ROWS[:5], "0.05,abc,1", *ROWS[6:]], ["record.csv:7: voltage_V: ", "abc", ";"]),
         (RECORD, [*ROWS[:20], *ROWS[25:]], ["record.csv:22: time_s: ", "0.06", ";"]),
         ("[record", ROWS, ["invalid TOML"]),
@@ -122,7 +122,7 @@ def test_malformed_input_is_one_line_and_leaves_nothing(
 def test_a_text_that_is_neither_config_nor_record_is_called_so(
     bwbayes: Type, tmp_path: Path, name: str
 ) -> None:
-    """Whatever examples of configs and tables are in it."""
+    """Examples of configs and tables may be in it."""
     example = f"\n```toml\n{RECORD}```\n[record]: a link\n"
     (tmp_path / name).write_text((ROOT / name).read_text(encoding="utf-8") + example)
     for command in ("run", "check"):
@@ -315,7 +315,7 @@ def test_a_files_name_need_not_be_utf_8(bwbayes: Type, tmp_path: Path) -> None:
     assert len(ROWS) == read_record(tmp_path / r"messung_\xe4.csv").samples
 
 
-# What the environment lacks ends in no traceback: encodings, readers, processes, caches
+# Nothing that the environment lacks ends in a traceback: encodings, readers, processes, caches
 
 
 def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -416,7 +416,7 @@ def inner():
 
 
 def test_what_is_compiled_of_other_sources_is_not_taken(tmp_path: Path) -> None:
-    """What is called has changed alone, which numba does not look at; else the cache is taken."""
+    """Only a called function has changed, which numba does not look at; else the cache is taken."""
     package = tmp_path / "bwbayes"
     shutil.copytree(Path(bw.__file__).parent, package, ignore=shutil.ignore_patterns("*cache*__"))
     (package / "inference" / "compiled" / "outer.py").write_text(OUTER)

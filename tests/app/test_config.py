@@ -252,7 +252,7 @@ EVERY = {key.path: key for key in keys(Config)}
 LEAVES = {path: key for path, key in EVERY.items() if key.table is None}
 every_part = pytest.mark.parametrize("name", [n for makers in PARTS.values() for n in makers])
 
-# What an example needs beside it to be a config.
+# Other keys that an example needs to be a config.
 WITH = {
     "parameters.NAME": "",
     "validation.NAME": "window = [1.0, 2.0]",

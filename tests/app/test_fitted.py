@@ -187,7 +187,7 @@ def test_a_prediction_is_the_command_lines(
 
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 def test_a_record_that_may_start_from_rest_says_what_that_would_change(fit: Run) -> None:
-    """Not one that is declared so, that starts elsewhere, or whose readings tell its state."""
+    """A record declared so, one that starts elsewhere or whose readings tell its state, is none."""
     sine = 60 * np.sin(np.linspace(0, 12, 200))
     for voltage, declared, expected in (
         (sine, False, True),

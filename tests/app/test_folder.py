@@ -112,7 +112,7 @@ def powerless() -> Iterator[None]:
 
 @pytest.fixture
 def read_only() -> Iterator[Path]:
-    # Not below pytest's own folder, which others may not even enter.
+    # It is not below pytest's own folder, which others may not even enter.
     with tempfile.TemporaryDirectory() as name:
         path = Path(name)
         yield path
@@ -448,7 +448,7 @@ def test_a_studys_digest_is_that_of_its_posterior(run: Path) -> None:
 
 
 def test_posterior_has_readings_log_likelihood_and_whether_it_has_converged(run: Path) -> None:
-    """Of each draw it is that of all readings; with the log prior it makes the log density."""
+    """For each draw it is that of all readings; with the log prior it makes the log density."""
     record, posterior = (
         read_record(run / "records/record.h5"),
         Run(RunFolder(run)).study.posterior,
@@ -547,7 +547,7 @@ def test_another_engine_is_refused_unless_asked_for(copy: RunFolder) -> None:
 
 # A run's files are for everybody: they open with common tools where bwbayes is not installed
 
-# What a colleague types who has arviz, xarray, pandas and corner, and no bwbayes.
+# Commands of a colleague who has arviz, xarray, pandas and corner, and no bwbayes.
 SCRIPT = """
 import json, sys
 from pathlib import Path

@@ -165,7 +165,7 @@ def test_any_ordinary_record_gets_a_config_that_resolves(
 @pytest.mark.parametrize("kind", ["sine", "decaying", "unipolar", "chirp", "triangle"])
 @pytest.mark.parametrize("periods", [9.3, 40.0])
 def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: float) -> None:
-    """Of every amplitude and rate that the drive has: no tail, and no end of a chirp."""
+    """It has every amplitude and rate of the drive: it is no tail, and no end of a chirp."""
     voltage = drive(kind, periods, np.arange(4000) / 4000)
     path = written(tmp_path / "a.csv", voltage, moved(voltage, np.random.default_rng(0)))
     held = np.zeros(voltage.size, dtype=np.bool_)

@@ -1,9 +1,9 @@
 """Ten thousand spoilt configs and records: each is used, or refused in one line.
 
-Every case goes through ``bwbayes check`` in this process. What is used must give finite numbers,
-and make a run's folder that reads back the same, with nothing written beside it. The best of some
-prior draws stands in for the point fit, no misfit is explained and no page is drawn, which take
-longer than all the rest, but for a few cases.
+Every case goes through ``bwbayes check`` in this process. Input that is used must give finite
+numbers, and make a run's folder that reads back the same, with nothing written beside it. The best
+of some prior draws stands in for the point fit, no misfit is explained and no page is drawn, which
+take longer than all the rest, but for a few cases.
 
 The default run takes the first 45, three of each kind, which find what befalls one case in 15 with
 a probability of 0.95, and one noise; ``-m slow`` takes all, and chooses theirs. A case is made
@@ -128,7 +128,7 @@ lead_in = 0.5
 """,
 )
 
-# What stands in a token's place: numbers, names, notes, tables, and what is none of them.
+# Texts in a token's place: numbers, names, notes, tables, and others.
 WORDS = """\
 nan -NaN inf 1e999 -1e999 1e308 1e-320 5e-324 -0 0 1 -1.5 1e9 -1e12 1_000 1,000 "1,000"
 1.000,5 1;5 0x1F 1j 2147483648 9223372036854775808 ١٢٣ １２ ½ −1 1e +-1 --1 . true False None
@@ -335,7 +335,7 @@ ODD_ARRAYS: tuple[Callable[[Any, Generator], Any], ...] = (
     lambda *_: "text instead",
 )
 
-# What HDF5 can have in a dataset's place.
+# Objects that HDF5 can have in a dataset's place.
 ODD_OBJECTS: tuple[Callable[[Any, str], Any], ...] = (
     lambda file, name: file.create_group(name),
     lambda file, name: file.__setitem__(name, h5py.SoftLink(f"/{name}")),
@@ -364,7 +364,7 @@ class TooLate(BaseException):
 
 @dataclass(frozen=True)
 class Said:
-    """What the command said of a case, its exit status, and the processor time it took, s."""
+    """The command's output on a case, its exit status, and the processor time it took, s."""
 
     status: int
     out: str
@@ -421,7 +421,7 @@ def check(one: Case, place: Path, seconds: int = SECONDS) -> Said:
 def limited(seconds: int) -> Iterator[None]:
     """Raise after some seconds, and end the process if it hangs where Python cannot raise.
 
-    What a case compiles, for later ones too, is not counted.
+    Compilation, which later cases use too, is not counted.
     """
 
     def late(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""What instruments are worth widens what depends on them; other quantities have their own units."""
+"""Unsure instruments widen what depends on them; other quantities have their own units."""
 
 import json
 import re
@@ -209,7 +209,7 @@ def test_certificate_is_one_printed_page(fit: bw.Run, tmp_path: Path) -> None:
 # Loops of other quantities: each run by one line, in its own words and units, and back again
 
 
-# Of alpha/d, and of beta and gamma times the amplitude.
+# The sds of alpha/d, and of beta and gamma times the amplitude.
 ALPHA, BETA, GAMMA = 0.6, 2.5, 1.5
 
 

@@ -1,8 +1,8 @@
 """A run may be killed at any moment: it goes on to the same bits, and leaves no process behind.
 
-The commands run in processes from a fork server, which has all imported already. What they do is
-what a person's do, but for pictures and explanations, which are spared. The slow test of random
-kills makes 200 of them, or as many as the environment variable KILLS says.
+The commands run in processes from a fork server, which has all imported already. They do what a
+person's do, but for pictures and explanations, which are spared. The slow test of random kills
+makes 200 of them, or as many as the environment variable KILLS says.
 """
 
 import os

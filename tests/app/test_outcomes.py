@@ -1,6 +1,6 @@
-"""What is said of a run that has not converged, failed or is inconclusive, or has a correction.
+"""Messages of a run that has not converged, failed or is inconclusive, or has a correction.
 
-What builds on a run says first how its validation came out, wherever it is read; that nothing is
+Each product of a run says first how its validation came out, wherever it is read; that nothing is
 said of a run that passed, each command's own tests say. Without convergence draws are kept, and
 there is no interval. A run whose bands fail on held-out readings has a corrected band.
 """

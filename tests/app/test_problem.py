@@ -118,7 +118,7 @@ def test_a_run_resolves_once_and_reads_each_record_once(
         monkeypatch.setattr(module, call.__name__, partial(counted, call))
     fit = bwbayes.fit(made.config, folder=tmp_path / "run", workers=1, progress=False)
     assert calls == {"windows_of": 1, "record_fields": 2}
-    # What is in its folder is what was fitted.
+    # Its folder holds the records that were fitted.
     read = bwbayes.open_run(tmp_path / "run")
     for name in ("config", "record_remarks", "facts", "plan"):
         assert getattr(read, name) == getattr(fit, name), name

@@ -296,6 +296,6 @@ def test_a_map_estimate_tells_what_share_is_done(
     map_estimate.fit(short_posterior(samples=400), np.random.default_rng(1), shares.append)
     assert shares == sorted(shares)
     assert 1.0 == shares[-1]
-    # Not only when all is done, and from its first steps on.
+    # It moves before all is done, and from its first steps on.
     assert 4 <= len({share for share in shares if share < 1.0})
     assert 4 <= len({share for share in shares if share < 0.5})

@@ -103,7 +103,7 @@ def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: W
 def test_the_only_motion_of_a_step_or_ramp_is_fitted(
     tmp_path: Path, begin: float, takes: float, noise: float
 ) -> None:
-    """Of a step nothing is held out; whatever is held out, the other readings move by half."""
+    """Nothing of a step is held out; whatever is held out, the other readings move by half."""
     rng, time = np.random.default_rng(4), np.arange(800) / 800
     ramp = np.clip((time - begin * (1 - takes)) / max(takes, 1e-6), 0.0, 1.0)
     voltage = 80 * ramp + noise * rng.standard_normal(time.size)
@@ -288,7 +288,7 @@ def test_readings_that_are_clipped_are_missing(write: Write) -> None:
 
 
 QUANTITIES = ("time", "voltage", "displacement")
-# What people call columns; none of them can be taken for a displacement.
+# Names that people give columns; none of them can be taken for a displacement.
 NAMES = ["a", "b", "U2", "ch 3", "ch 4", "t", "T1", "time_s", "voltage_mV"]
 SAMPLES = 12
 
@@ -378,7 +378,7 @@ def test_a_second_file_of_the_same_columns_is_read_as_the_first(
 def test_a_file_of_other_columns_is_read_by_itself(
     kind: tuple[list[str], list[str], RecordConfig],
 ) -> None:
-    """Whatever numbers and units the config gave; as is one of a run that noted nothing."""
+    """The config's numbers and units do not matter; nor do they in a run that noted nothing."""
     names, quantities, source = kind
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
@@ -486,7 +486,7 @@ def test_predict_validates_on_a_second_file_of_the_same_kind(
         for name in ("next", "same")
     )
     assert first["max_error_um"] == pytest.approx(second["max_error_um"], rel=1e-6)
-    # What is said of the file itself counts alone.
+    # Only the statements on the file itself count.
     own = "--column", "time=a", "--column", "voltage=b", "--column", "displacement=c"
     said = bwbayes("predict", copy.path, "--record", renamed, *own, "--out", "own.csv")
     said.assert_refused("which unit has", "--unit displacement=um")

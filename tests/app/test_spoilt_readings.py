@@ -92,7 +92,7 @@ def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: i
 
 @pytest.mark.slow
 def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
-    """Of 100 records; and all spikes are found, no good reading is set aside, widths are the same.
+    """In 100 records; and all spikes are found, no good reading is set aside, widths are the same.
 
     By chance one of the 18 counts is beyond its binomial limits at most once in 100 times
     (Bonferroni): 33 to 67 and 86 to 100. How many cover without spikes is kept beside them.
@@ -233,7 +233,7 @@ def test_exactly_the_spikes_are_set_aside(seed: int) -> None:
 
 @pytest.mark.slow
 def test_exactly_the_spikes_are_set_aside_in_200_records() -> None:
-    """Of up to 20,000 readings; one in a hundred may be off."""
+    """In up to 20,000 readings, one in a hundred of which may be off."""
     said = {seed: off(of_the_family(seed, 20_000)) for seed in range(1000, 1200)}
     assert sum(bool(text) for text in said.values()) <= 2, said
 
@@ -241,7 +241,7 @@ def test_exactly_the_spikes_are_set_aside_in_200_records() -> None:
 @pytest.mark.parametrize("size", [40.0, 1e9])
 @pytest.mark.parametrize("row", [0, 1, 59])
 def test_a_spike_of_a_small_record_is_seen_and_hides_nothing(row: int, size: float) -> None:
-    """What is seen of the record is what is seen without it: no wrong unit, no other relation."""
+    """The record's findings are those without it: no wrong unit, no other relation."""
     good = small_record(60, 20.0, np.random.default_rng(2))
     spoiled = with_spikes(good, np.array([row]), np.array([size]), np.array([-1.0]))
     found, expected = inspect(spoiled.record), [one.kind for one in inspect(good)]

@@ -149,7 +149,7 @@ def test_a_pickle_in_a_chain_is_refused_or_inert(
 
 
 def test_a_run_loads_no_code_while_it_reads(tmp_path: Path) -> None:
-    """What Python itself reports of pickles, compiled code and other programs."""
+    """Audit events of Python for pickles, compiled code and other programs."""
     events: list[str] = []
     listening = [True]
     # NumPy parses the header of an array, a literal; what is compiled so is not run.

@@ -34,7 +34,7 @@ def _checks(tables: Tables) -> float:
     return run.number("checks") / sum(map(run.number, runs.PARTS))
 
 
-# What tests/README.md quotes.
+# The figures that tests/README.md quotes.
 QUOTED: dict[str, Callable[[Tables], float]] = {
     "effective draws/s, times emcee's defaults on a per-sample NumPy loop": _times("stock"),
     "effective draws/s, times emcee's defaults on our NumPy engine": _times("numpy"),

@@ -1,4 +1,4 @@
-"""What a campaign of a thousand short records costs: fits, their folders, and combining them.
+"""Cost of a campaign of a thousand short records: fits, their folders, and combining them.
 
 ``python -m tests.benchmarks campaigns`` draws actuators around those of
 ``runs/calibration.toml``, writes a record of 300 samples of each into a folder, and lets

@@ -1,4 +1,4 @@
-"""What a sample of a model costs: by engine, in two threads, forward and backward."""
+"""Cost of a model's sample: by engine, in two threads, forward and backward."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -124,7 +124,7 @@ def _read_backwards(model: SampledModel, displacement: FloatArray) -> None:
 def inversion(rounds: int) -> Table:
     """Measure the inverse of many draws against simulating them, on the paper's record.
 
-    What is asked for is the displacement of their middle; each draw gets a voltage of its own.
+    The reference is the displacement of their middle; each draw gets a voltage of its own.
     """
     voltage = signal("identification").sample(1000.0)[1][:SAMPLES]
     rows: list[dict[str, Cell]] = []

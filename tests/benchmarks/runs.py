@@ -87,7 +87,7 @@ def sampling(rounds: int, steps: int) -> Iterator[tuple[str, Table]]:
     """Measure whole runs and the stretch move of so many steps, and the ratios between them."""
     paper = paper_record()
     posterior = paper.study.posterior
-    # What is not timed: the first call on the compiled engine, and a first run to start from.
+    # The first call on the compiled engine and a first run to start from are not timed.
     first = our_run(paper)
     draws = first.chain.coordinates("sampling").reshape(-1, posterior.prior.dimensions)
     chosen = np.random.default_rng(1).choice(len(draws), MODELS, replace=False)

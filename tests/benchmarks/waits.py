@@ -2,8 +2,8 @@
 
 ``python -m tests.benchmarks waits --against ../before`` does each thing with this checkout and with
 the other one, in turns, each in a process of its own with the checkout's own ``.venv``, and prints
-CPU seconds of all its processes and their ratio: the machine may be busy with other things. What
-one step leaves (a run's folder) is what the next ones open.
+CPU seconds of all its processes and their ratio: the machine may be busy with other things. Each
+step opens the run's folder that an earlier one leaves.
 """
 
 import os
@@ -99,7 +99,7 @@ result = None
 
 RING = 'command("run", "runs/ring_bender.toml", "--out", out + "/{}")'
 
-# What is waited for: what comes before it and is not measured, and what is measured.
+# A wait: a call before it that is not measured, and the one that is.
 WAITS: dict[str, tuple[str, str]] = {
     "first run, everything compiled": ("", RING.format("cold")),
     "run": ("", RING.format("warm")),

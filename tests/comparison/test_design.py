@@ -1,4 +1,4 @@
-"""What to measure next: the promise is the closed form's, tells good drives from poor, and is kept.
+"""The next measurement: the promise is the closed form's, tells good drives from poor, and is kept.
 
 The promise is kept where a record is simulated from a draw of the posterior, with a start and an
 offset of its own, and fitted together with the first: what is left of the sd is then, over several
@@ -59,10 +59,10 @@ def promised(
 
 
 def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
-    """Of d beside the offset; the new record has an offset of its own, of the same prior."""
+    """The sd of d beside the offset; the new record has an offset of its own, of the same prior."""
     model = Linear(("d", "offset"), "discrepancy")
     exact, posterior = model.exact, model.posterior
-    # Not about zero, so that the offset counts.
+    # It is not about zero, so that the offset counts.
     voltage = 50 + 0.5 * decaying_sine(150)
     (score,) = promised((posterior, exact.draw(40_000, 1)), {"sine": voltage}, "d")
     # dx/dd is the lagged voltage, seen by two slopes.
@@ -81,7 +81,7 @@ def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
 def test_large_loops_are_told_from_small_ones_and_four_from_one(
     known: tuple[Posterior, FloatArray],
 ) -> None:
-    """Of the loop's shape, and of the band on another drive: by more than three errors."""
+    """For the loop's shape, and for the band on another drive: by more than three errors."""
     candidates = {"four": steady(), "one": steady()[: SAMPLES // 4], "small": steady(5.0)}
     for target in ("beta", decaying_sine(SAMPLES, periods=7.0, amplitude=50.0)):
         best, second, worst = promised(known, candidates, target)
@@ -168,7 +168,7 @@ def test_promises_of_eight_signals_are_kept_in_their_order(
 def test_drives_that_tell_rivals_apart_are_told_from_those_that_do_not() -> None:
     """Duhem and Bouc-Wen, fitted to a decaying sine: the whole range tells, a volt does not.
 
-    What is too far for the amplifier is refused. The same model once more cannot be told apart.
+    A drive too far for the amplifier is refused. The same model once more cannot be told apart.
     """
     rng = np.random.default_rng(4)
     stand = Stand(lag=0.005, discrepancy=0.0, sensor=0.5)

@@ -131,7 +131,7 @@ def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
 
 
 def test_nested_sampling_agrees() -> None:
-    """Of dynesty, on the virtual stand's record, within 0.1 nats.
+    """It is that of dynesty, on the virtual stand's record, within 0.1 nats.
 
     Its prior is not divided by the mass that the constraints leave.
     """

@@ -188,7 +188,7 @@ def test_a_record_without_hysteresis_is_said_to_have_none(
     assert any("no hysteresis" in line for line in comparison.lines)
 
 
-# What is recommended follows from the numbers, and what cannot be told is called so
+# The recommendation follows from the numbers, and says what cannot be told
 
 
 def noise(seed: int, size: int = 10) -> FloatArray:
@@ -309,7 +309,7 @@ def test_without_hysteresis_it_says_so() -> None:
 
 
 def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
-    """What was only screened is in the table, and no caveat."""
+    """A model that was only screened is in the table, and in no caveat."""
     lost = Candidate("lost", "lost", False, "budget used up", 4, 1000)
     evidence = Evidence(-300.0, np.inf, 0.0, 0.0, 5.0, -290.0)
     far = Candidate("far", "far", False, "", 4, 1000, evidence=evidence, screened=True)

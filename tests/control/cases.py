@@ -48,7 +48,7 @@ VALUES = {
     "b2": 0.06, "b3": 0.05, "b4": -0.07, "b5": 0.04, "b6": 0.08,
 }  # fmt: skip
 
-# What some of them have instead; without γ, h is twice as steep after a turn as at zero.
+# Other values for some of them; without γ, h is twice as steep after a turn as at zero.
 OTHERS = {
     "not passive": {"gamma": 0.035},
     "backlash": {"alpha": 0.25},

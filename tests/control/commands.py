@@ -31,7 +31,7 @@ from tests.sampled import sampled
 CONFIG = Path(__file__).resolve().parents[2] / "runs" / "ring_bender.toml"
 LIMITS = Limits(-100.0, 100.0)
 
-# Of the stand whose voltage is measured: sds, um, time, s, and the rate at which it moves, Hz.
+# The stand whose voltage is measured: sds, um, time, s, and the rate at which it moves, Hz.
 SENSOR, DISCREPANCY, TIME, FAST = 0.1, 0.3, 0.5, 10_000.0
 
 

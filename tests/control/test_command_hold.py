@@ -105,7 +105,7 @@ def test_truths_are_where_a_command_for_a_dac_says(measured: Run, asked: Referen
 
 
 def test_a_model_is_exported_for_a_dac(measured: Run, tmp_path: Path) -> None:
-    """Whatever the voltage did in the record, unless it is said."""
+    """The record's hold does not count, unless it is stated."""
     flat = about(measured, 0.001, 3, np.random.default_rng(1))
     held = export(fit_of(measured, flat), tmp_path / "held")
     straight = export(fit_of(measured, flat), tmp_path / "straight", hold="foh")

@@ -1,6 +1,6 @@
 """A model a sample at a time: coefficients, a discrete system of scipy, and C that agrees.
 
-What is printed as C does what the function does; what cannot be printed is refused.
+A function printed as C does the same; one that cannot be printed is refused.
 """
 
 import ctypes
@@ -117,7 +117,7 @@ def test_a_value_that_cannot_be_used_holds_the_last_voltage(
     command, held = compiled.run_with_flags("inverse", voltage[0], given)
     np.testing.assert_array_equal(held, lost)
     np.testing.assert_array_equal(command[lost], np.append(voltage[0], command)[:-1][lost])
-    # What follows is met as ever, unless a limit is in the way.
+    # Later references are met as ever, unless a limit is in the way.
     late = int(hold == "zero")
     reached = compiled.run("forward", voltage[0], command)
     free = ~lost & (command > cases.SPAN.low) & (command < cases.SPAN.high)
@@ -363,7 +363,7 @@ def test_slopes_lie_within_their_bounds(name: str) -> None:
     slopes = np.diff(w)[:, moves] / np.diff(path)[moves]
     assert (slopes >= least[:, np.newaxis] - 1e-9).all()
     assert (slopes <= largest[:, np.newaxis] + 1e-9).all()
-    # Not far from them, or they would say nothing.
+    # It is not far from them, or they would say nothing.
     assert (slopes.min(axis=1) - least < 0.12 * largest).all()
     assert (largest - slopes.max(axis=1) < 0.12 * largest).all()
 

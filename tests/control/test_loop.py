@@ -292,7 +292,7 @@ def test_the_controllers_zeros_are_the_models_poles() -> None:
 
 
 def test_slopes_that_change_from_sample_to_sample_leave_it_stable() -> None:
-    """What the circle criterion promises, tried: increments die out whatever the slopes are."""
+    """The circle criterion's promise, tried: increments die out whatever the slopes are."""
     draws = models("bouc-wen, second-order", 3)
     gains, result = design(draws, draws, cases.SPAN, 1, Robustness())
     assert (result.circle > 0).all()
@@ -324,7 +324,7 @@ def test_a_slope_that_may_vanish_is_refused() -> None:
         design(one, one, cases.SPAN, 1, Robustness())
 
 
-# What tracking promises: with feed-forward, PID control follows better than with either alone
+# The promise of tracking: with feed-forward, PID control follows better than with either alone
 
 
 # As the ring bender's posterior has them; d and α go together, so that the loop keeps its size.

@@ -25,7 +25,7 @@ from tests.programs import needs
 OFFSET, INTERVAL = 7.0, 0.005
 TIME = INTERVAL * np.arange(400)
 
-# Of a model with a gain about the middle of 0 to 100 V, which is not zero at zero volts.
+# A model with a gain about the middle of 0 to 100 V, which is not zero at zero volts.
 VALUES = {
     "d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "quadratic": 1.5, "lag": 3.8e-3,
     "offset": OFFSET, "sensor_sd": 0.1, "discrepancy_sd": 1e-6, "discrepancy_time": 0.5,

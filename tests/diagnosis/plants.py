@@ -15,7 +15,7 @@ from tests.stand import play, process
 
 RATE, FINE = 200.0, 8
 
-# What is planted, and what it may be called.
+# Planted defects, and the names they may get.
 CAUSES: dict[str, set[str]] = {
     "transient": {"transient"},
     "drift": {"drift"},
@@ -146,7 +146,7 @@ def at_actuator(kind: str, fine: FloatArray, rng: np.random.Generator) -> FloatA
         case "slew limit":
             return limited(fine, rng.uniform(0.5, 0.8) * fastest)
         case "hold":
-            # What is read at a sample has not seen its voltage yet.
+            # A reading at a sample has not seen its voltage yet.
             return np.concatenate([fine[:1], np.repeat(fine[::FINE], FINE)[:-1]])
     return fine
 
@@ -256,10 +256,10 @@ def bench(kind: str, seed: tuple[int, int], cured: str = "", seconds: float = 10
     """Measure a plant twice: as :func:`plant` does, and again along another drive.
 
     A ``cured`` cause is absent from both, all else is the same. The other drive goes no faster and
-    no further than the first, so that what is planted has one size. What happens once does not
-    happen again. The discrepancy forgets within a fiftieth of the first record, so that this tells
-    its size, and the coverage of the second, of 200 such times, is no matter of luck; as an offset
-    of its own would be, from a lead-in of ten.
+    no further than the first, so that what is planted has one size. An event does not happen again.
+    The discrepancy forgets within a fiftieth of the first record, so that this tells its size, and
+    the coverage of the second, of 200 such times, is no matter of luck; as an offset of its own
+    would be, from a lead-in of ten.
     """
     rng, later = (np.random.default_rng((*seed, number, *kind.encode())) for number in range(2))
     part, first = drawn(rng), drive(rng, seconds)

@@ -22,7 +22,7 @@ NAMES = (
 )  # fmt: skip
 DEFAULTS: Any = {name: declared(name).default(context(RANGES)) for name in NAMES}
 
-# What a good run's posterior is like: mean and sd.
+# A good run's posterior: mean and sd.
 GOOD = {
     "d": (0.7, 0.005), "alpha": (0.36, 0.01), "beta": (0.027, 0.001), "gamma": (0.017, 0.003),
     "initial": (0.5, 1.0), "lag": (0.004, 0.001), "offset": (0.3, 0.5), "sensor_sd": (0.5, 0.003),

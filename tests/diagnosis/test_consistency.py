@@ -62,12 +62,12 @@ def test_a_record_with_another_noise_is_named_and_no_other() -> None:
 
 @pytest.mark.slow
 def test_false_alarms_are_as_rare_as_they_should_be() -> None:
-    """Of 100 pairs of records of one actuator 5% lie beyond the 95% of the chi-square.
+    """5% of 100 pairs of records of one actuator lie beyond the 95% of the chi-square.
 
-    Of 200 comparisons, which come in pairs that are nearly the same: within three standard errors
-    of 100 independent ones, 0 to 11.5%, and at most two at the level of an alarm, where 0.2 to 0.4
-    are expected. Fails by chance once in 100 times. Twin: with a tenth more gain nine in ten are
-    named.
+    The 200 comparisons come in pairs that are nearly the same: the share is within three standard
+    errors of 100 independent ones, 0 to 11.5%, and at most two at the level of an alarm, where 0.2
+    to 0.4 are expected. Fails by chance once in 100 times. Twin: with a tenth more gain nine in ten
+    are named.
     """
     every = [compared(pair(seed)) for seed in range(100)]
     p = np.array([[one.p_value for one in both.values()] for both in every])

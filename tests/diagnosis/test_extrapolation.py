@@ -77,7 +77,7 @@ FAST = fitted(75 * np.sin(4 * np.pi * TIME), 0.005)
 
 
 def test_a_slow_sine_and_a_hold_are_said() -> None:
-    """Of a fit of 2 Hz for 16 s that holds, the bands cover 34% of the one, 0.3% of the other."""
+    """A fit of 2 Hz for 16 s passes, and its bands cover 34% of the one, 0.3% of the other."""
     long = np.arange(0, 100, 0.005)
     slow, duration = beyond_training(FAST, Inputs(75 * np.sin(0.04 * np.pi * long), interval=0.005))
     assert ("slow", "duration") == (slow.kind, duration.kind)

@@ -40,7 +40,7 @@ estimate_offset = false
 
 @dataclass(frozen=True)
 class SamplingResult:
-    """What came of a plant: its causes and the fix, then whether bands pass and the coverage."""
+    """The outcome of a plant: its causes and the fix, then whether bands pass and the coverage."""
 
     causes: tuple[str, ...]
     right: bool
@@ -142,7 +142,7 @@ def test_a_fix_that_is_followed_is_right_for_the_next_record(kind: str, tmp_path
 
 @pytest.mark.slow
 def test_plants_get_their_cause_and_its_fix_covers_their_next_record(tmp_path: Path) -> None:
-    """Of 20 kinds at least 90% get their cause and are then covered; of good ones 1% get one.
+    """At least 90% of 20 kinds get their cause and are then covered; 1% of good ones get one.
 
     The right cause may be tied, and 90 to 99% of readings lie in the next record's 95% band. No
     bands pass on the record that was fitted and cover less than 85% of the next one.
@@ -195,7 +195,7 @@ def test_a_better_model_keeps_a_run_from_passing(kind: str, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_no_run_passes_whose_next_record_is_not_covered(tmp_path: Path) -> None:
-    """Of 20 kinds of wrong models none; of the right one at most 1% are kept from passing."""
+    """None of 20 kinds of wrong models passes; at most 1% of right ones are kept from it."""
     figures: dict[str, object] = {"seeds": len(NEXT_SEEDS), "good": NEXT_GOOD}
     false = 0
     for kind in CAUSES:

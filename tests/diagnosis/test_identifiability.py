@@ -1,7 +1,7 @@
 """One constant amplitude does not identify the model, decaying amplitudes do, and the user hears.
 
-At the test stand's 1000 Hz, with the damping free. What is left depends on the record and the mode
-alone, so the mode is put at the truth.
+At the test stand's 1000 Hz, with the damping free. The remaining sd depends on the record and the
+mode alone, so the mode is put at the truth.
 """
 
 from typing import Literal
@@ -69,7 +69,7 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
 
 
 def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
-    """What it shows is d - alpha and alpha beta: both may grow while beta falls."""
+    """It shows d - alpha and alpha beta: both may grow while beta falls."""
     fixed = {"gamma": 0.0, "initial": 0.0, "mass": 0.00134, "stiffness": 4.1e5}
     record = measured(sines(10.0, 1.0, 3.0), rate=250.0).single_record
     small = posterior_of(record.voltage, record.displacement, record.actuator, "discrepancy", fixed)
@@ -107,7 +107,7 @@ def test_what_is_left_of_one_parameter_is_that_of_the_dense_matrix(sigma: float)
     np.testing.assert_allclose(expected, left, rtol=0.03)
 
 
-# What a record taught is what the closed form says, and a prior that decides is named
+# A record's information is that of the closed form, and a prior that decides is named
 
 
 def exact(model: Linear, spread: float = 1.0) -> FloatArray:
@@ -140,7 +140,7 @@ def test_the_contraction_is_that_of_the_variances(model: Linear) -> None:
 
 
 def test_the_worst_combination_is_the_closed_forms(model: Linear) -> None:
-    """Of the whitened posterior covariance the largest eigenvalue, and how it moves."""
+    """The largest eigenvalue of the whitened posterior covariance, and how it moves."""
     made = of(model.posterior, exact(model))
     values, vectors = np.linalg.eigh(model.exact.covariance / np.outer(model.sd, model.sd))
     worst, left_of_it = made.combinations[0]

@@ -40,7 +40,7 @@ def changed(posterior: Posterior, added: FloatArray) -> Posterior:
 
 
 def test_good_records_are_not_odd() -> None:
-    """Of eight statistics of ten records three or more are odd with a probability of 0.01."""
+    """Three or more of eight statistics of ten records are odd with a probability of 0.01."""
     odd = 0
     for seed in range(10):
         made = looked_at(short_posterior(samples=SAMPLES, seed=seed))
@@ -129,7 +129,7 @@ def test_each_departure_is_remarked_on(
 
 @pytest.mark.parametrize("samples", [30, 301, 4000])
 def test_power_by_octave_is_judged_at_the_stated_rate(samples: int) -> None:
-    """Of 1,000 white records 28 to 77 have p below 0.05: all but one in a thousand such studies.
+    """28 to 77 of 1,000 white records have p below 0.05: all but one in a thousand such studies.
 
     Each octave's power is that of the periodogram between its edges, and the highest edge is the
     last frequency below Nyquist's.

@@ -1,4 +1,4 @@
-"""What is wrong with a record is named, and nothing is said about a good one."""
+"""Every defect of a record is named, and nothing is said about a good one."""
 
 import re
 from ast import literal_eval
@@ -66,7 +66,7 @@ SQUARE = np.sign(SINE + 1e-9)
 def test_a_coarse_sensor_alone_is_not_taken_for_a_clipped_one(
     step: float, shift: float, voltage: FloatArray, lag: int
 ) -> None:
-    """Not at smooth peaks, whatever the phase, and not at rest on the highest plateau."""
+    """Smooth peaks are not clipped, whatever the phase, nor is rest on the highest plateau."""
     coarse = np.round(np.roll(voltage, lag) / step + shift) * step
     assert [] == findings("clipping", voltage, coarse)
 
@@ -208,7 +208,7 @@ def without_memory(seed: int, loop: float = 0.0) -> Record:
 def test_where_no_loop_shows_it_is_said_and_where_one_does_it_is_not(
     records: int, named: int
 ) -> None:
-    """Of 100 records four are not named by chance once in 50 times, of 10 two once in 200.
+    """Four of 100 records are not named by chance once in 50 times, two of 10 once in 200.
 
     Loops are 1% of the range.
     """
@@ -277,7 +277,7 @@ def test_a_jump_of_the_offset_is_named_with_its_time_and_its_shorter_side_left_o
     assert "jump" == finding.kind
     named = [float(text) for text in re.findall(r"um at ([\d.]+) s", finding.text)]
     np.testing.assert_allclose(named, time[rows], atol=1e-9)
-    # What the voltage moves meanwhile is no part of it, but for some of the loop's width.
+    # The voltage's own motion meanwhile is no part of it, but for some of the loop's width.
     sizes = [float(text) for text in re.findall(r"([+-][\d.e+]+) um at", finding.text)]
     np.testing.assert_allclose(sizes, [jump, -jump][: len(rows)], rtol=0.1)
     windows = literal_eval(finding.fix.partition("= ")[2].removesuffix(" under [record]"))
@@ -354,7 +354,7 @@ def loaded(seed: int, *, of_plays: bool, transients: Sequence[float]) -> list[Re
 def test_a_record_that_begins_while_it_is_loaded_has_no_transient(
     of_plays: bool, settling: int
 ) -> None:
-    """Of 12 at most 3 are said to have one.
+    """At most 3 of 12 are said to have one.
 
     With a transient of 30% of the range from below, 11 or more; from above, which is against what
     the loading has left, 5 or more, and of plays, whose loops are followed, 9.
@@ -394,7 +394,7 @@ def crept(seed: int, drifts: Sequence[float]) -> list[Record]:
 
 
 def test_creep_is_no_drift_and_a_drift_beside_it_is_found() -> None:
-    """Of 18 good records 0 are called drift or a transient; of 18 with 20% of drift, 15 or more."""
+    """None of 18 good records has a drift or a transient; 15 or more of 18 with 20% of drift do."""
     good, drifting = zip(*(crept(seed, (0.0, 0.2)) for seed in range(18)), strict=True)
     kinds = {finding.kind for record in good for finding in inspect(record)}
     assert not {"drift", "switch-on transient"} & kinds

@@ -264,7 +264,7 @@ def test_misfit_of_another_drive_is_not_one_of_this() -> None:
 
 @pytest.mark.parametrize(("size", "seen"), [(0.0, (0.0, 0.03)), (0.5, (0.95, 1.0))])
 def test_parts_of_a_record_tell_of_each_other(size: float, seen: tuple[float, float]) -> None:
-    """What follows a multisine, half as large as white noise, is seen; the noise alone is not."""
+    """An error that follows a multisine, half of white noise, is seen; the noise alone is not."""
     found = []
     for number in range(100):
         rng = np.random.default_rng((55, number))
@@ -286,7 +286,7 @@ def test_posterior_of_a_record_is_looked_at(planted: bool) -> None:
     lock = drive_lock(posterior, free, rng)
     assert lock.locked is planted
     assert ["follows the drive" in str(finding) for finding in lock.findings] == [True] * planted
-    # What to do is to measure a record that `design` finds.
+    # The fix is to measure a record that `design` finds.
     assert all("bwbayes design FOLDER --validate" in finding.fix for finding in lock.findings)
     assert lock.numbers["follows_the_drive"] is planted
 

@@ -24,7 +24,7 @@ from tests.stand import process
 
 FITTED = (-100.0, 100.0)
 
-# What is added to the readings of a good record, by cause; sd is that of its sensor band.
+# Errors added to the readings of a good record, by cause; sd is that of its sensor band.
 Spoil = Callable[[np.random.Generator, Made, float], FloatArray]
 
 
@@ -182,7 +182,7 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str, records: int) 
 def test_a_step_is_named_with_its_time_and_a_hum_with_its_source(
     number: int, along: float, mains: int, size: float
 ) -> None:
-    """Of readings that were not fitted too; nothing of either is empty."""
+    """Those of readings that were not fitted too; none is empty."""
     record = made(np.random.default_rng(number), length=20.0, interval=0.005, sensor=0.1)
     sd = float(record.sds["sensor"].mean())
     row = round(along * record.time.size)
@@ -312,7 +312,7 @@ def test_a_lead_in_that_does_not_fit_is_said_only_where_bands_do_not_hold_after_
 
 
 def test_the_cause_of_a_large_error_takes_most_of_it_away() -> None:
-    """Not three outliers, whatever their evidence is."""
+    """Three outliers are none, whatever their evidence is."""
     poor = made(np.random.default_rng(5), length=30, discrepancy=9.0, memory=0.2)
     background = ValidationContext(poor.memory, 0.0, FITTED)
     tails = Explanation("heavy tails", "outliers", "do", nats=900.0, rmse=(9.0, 8.9), foreign=True)
@@ -336,7 +336,7 @@ def test_the_cause_of_a_large_error_takes_most_of_it_away() -> None:
 
 @pytest.mark.parametrize("kind", ["gain", "noise"])
 def test_no_cause_of_a_training_record_compares_it_with_training(kind: str) -> None:
-    """What no explanation takes away is unknown there. The twin: a separate record's has a name."""
+    """An error that nothing explains is unknown there. The twin: a separate record's has a name."""
     for seed in range(3):
         record = made(np.random.default_rng(seed), 30, memory=0.2)
         bands = bands_of(record, training=True)

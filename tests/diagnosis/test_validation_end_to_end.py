@@ -196,7 +196,7 @@ def test_good_runs_hold(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT_KINDS)
 def test_no_spoilt_run_holds(tmp_path: Path, kind: str) -> None:
-    """Of 50 of each kind none is missed; the cause is right in nine of ten of those seen."""
+    """None of 50 of each kind is missed; the cause is right in nine of ten of those seen."""
     counts = spoilt_runs(kind, 20261126, SPOILT, tmp_path)
     every = measured().get("spoilt runs do not hold", {})
     keep("spoilt runs do not hold", every | {kind: dict(counts)})

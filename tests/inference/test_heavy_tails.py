@@ -91,7 +91,7 @@ def test_engines_agree(noise: str) -> None:
     prior = moving(noise, "numpy").prior
     theta = prior.theta(prior.draw(np.random.default_rng(6), 40))
     for found, expected in zip(fast.start(theta), slow.start(theta), strict=True):
-        # Of a variance that readings make small, rounding of the large one before is left.
+        # A variance that readings make small has the rounding of the large one before.
         rounding = 1e-11 * np.max(np.abs(expected))
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=rounding)
     shapes = np.sin(np.outer([0.01, 0.3], np.arange(slow.readings.rows.size)))
@@ -203,8 +203,9 @@ def ranks(noise: Noise, readings: int, records: int, factor: float = 1.0) -> Flo
 def test_posteriors_are_calibrated(readings: int, records: int) -> None:
     """Ranks of sensor_sd and sensor_tail are uniform: by chance one of four fails in 2,500 runs.
 
-    Of 200 records a bias of 0.3 sds is found in 90%, of 1,000 one of 0.12 sds. The twin, sensors a
-    tenth larger than said, which is a bias of about one sd in 150 readings, must be found.
+    With 200 records a bias of 0.3 sds is found in 90%, with 1,000 one of 0.12 sds. The twin,
+    sensors a tenth larger than said, which is a bias of about one sd in 150 readings, must be
+    found.
     """
     noise = noise_model("discrepancy + student", INTERVAL)
     for found in ranks(noise, readings, records).T:

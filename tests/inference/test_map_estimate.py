@@ -115,7 +115,7 @@ def test_the_covariance_is_that_of_the_curvature(fits: Fits, name: str) -> None:
 def test_both_modes_of_a_record_of_one_amplitude_are_seen(
     tmp_path: Path, number: int, least: float
 ) -> None:
-    """Whatever the seed. Of the second, least squares sees one optimum between the two."""
+    """The seed does not matter. In the second, least squares sees one optimum between the two."""
     study, _ = made((7, number), tmp_path)
     for seed in range(4):
         point = fit(study.posterior, np.random.default_rng(seed))
@@ -270,7 +270,7 @@ def test_a_direction_without_any_curvature_leaves_a_covariance(width: float) -> 
 
 @every_case
 def test_a_climb_to_a_normal_posterior_ends_at_its_mode(free: tuple[str, ...], noise: str) -> None:
-    """Of several starts the best, with the Fisher information's covariance."""
+    """It is the best of several starts, with the Fisher information's covariance."""
     model, target = LINEAR[noise], Target(LINEAR[noise].posterior)
     state = climb(target, np.array([[3.0, -2.0, 1.0], [0.5, 4.0, -1.0]])[:, : len(free)])
     away = (model.mean + state.coordinates * model.sd - model.exact.mean) / model.exact.sd
@@ -324,7 +324,7 @@ numbers = st.floats(-3.0, 3.0)
 def test_a_slope_is_the_complex_steps_within_its_error(
     rate: float, phase: float, z: float, power: int
 ) -> None:
-    """Of exp(sin(rate z + phase)), in any unit: h²|f‴|/6 by truncation, and a few ε|f|/h."""
+    """For exp(sin(rate z + phase)), in any unit: h²|f‴|/6 by truncation, and a few ε|f|/h."""
     unit = 10.0**power
 
     def function(places: FloatArray) -> FloatArray:

@@ -131,7 +131,8 @@ def test_draws_have_the_covariance(quality: float | None) -> None:
     assert abs(np.std(draws[:, 1]) / 0.3 - 1) < 0.02
     factor = np.linalg.cholesky(dense(theta, np.arange(40), INTERVAL))
     white = scipy.linalg.solve_triangular(factor, draws.sum(axis=1).T, lower=True)
-    # Of independent standard normals: each mean square by itself, and the first with the others.
+    # They are independent standard normals: each mean square by itself, and the first with the
+    # others.
     squares = np.mean(white**2, axis=1) - 1
     assert np.abs(squares).max() * np.sqrt(800 / 2) < 4.5
     across = np.mean(white[0] * white[1:], axis=1)
@@ -228,7 +229,7 @@ def test_engines_agree_on_an_offset_any_stride_and_gaps(stride: int) -> None:
 
 
 def test_the_size_on_new_readings_is_that_of_the_residuals() -> None:
-    """Whatever the kernel says of it; a rough discrepancy's size is the kernel's."""
+    """The kernel has no say in it; a rough discrepancy's size is the kernel's."""
     for noise in ("smooth", "discrepancy"):
         posterior = short_posterior(noise, 400)
         theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(7), 20))

@@ -325,7 +325,7 @@ def test_true_parameters_lie_well_inside_whatever_the_drive(amplitude: float, bi
 
 
 def test_scales_of_beta_and_gamma_follow_the_exponent() -> None:
-    """What is a rate of 0.0272 / V at an h of 8 um lies inside, be the exponent known or free."""
+    """A rate of 0.0272 / V at an h of 8 um lies inside, be the exponent known or free."""
     voltage = drive()
     ranges = ranges_of(Inputs(voltage, interval=1e-3), displacement(voltage))
     free = cut_draws(ranges, Distribution("uniform", {"lower": 1.0, "upper": 5.0}))
@@ -337,7 +337,7 @@ def test_scales_of_beta_and_gamma_follow_the_exponent() -> None:
 
 @given(digits=st.integers(0, 3), scale=st.floats(0.1, 10), seed=st.integers(0, 9))
 def test_readings_without_noise_have_that_of_rounding(digits: int, scale: float, seed: int) -> None:
-    """Of q/√12 in multiples of q, of 2⁻²⁴ of the range in others; none is said of noisy readings.
+    """It is q/√12 in multiples of q, 2⁻²⁴ of the range in others, and 0 in noisy readings.
 
     Scaled readings have a scaled rounding.
     """

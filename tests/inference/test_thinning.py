@@ -85,7 +85,7 @@ def test_a_long_record_begins_until_its_voltage_has_been_nearly_everywhere(
 
 @given(periods=st.floats(1.0, 12.0), decay=st.floats(0.0, 0.9), stride=st.integers(2, 10))
 def test_the_reversals_of_a_drive_stay(periods: float, decay: float, stride: int) -> None:
-    """Whatever sample they are at: the operator remembers what it remembers of the whole record."""
+    """At any sample: the operator remembers what it remembers of the whole record."""
     along = np.linspace(0.0, 1.0, 2000)
     voltage = 100 * np.sin(2 * np.pi * periods * along) * (1 - decay * along)
     rising = np.sign(np.diff(voltage))
@@ -118,7 +118,7 @@ def test_a_thinned_record_is_left_the_residuals_of_the_whole() -> None:
         for posterior in (whole, corrected, short)
     ]
     np.testing.assert_allclose(residuals[1], residuals[0][::8], atol=1e-9)
-    # Not without: the lag follows another drive between the samples.
+    # Without it there is an error: the lag follows another drive between the samples.
     assert np.max(np.abs(residuals[2] - residuals[0][::8])) > 1e-3
 
 

@@ -1,4 +1,4 @@
-"""What drives an actuator on one clock, and its turning points, times and speeds."""
+"""Inputs of an actuator on one clock, and their turning points, times and speeds."""
 
 from itertools import pairwise
 
@@ -34,7 +34,7 @@ def record_of(samples: int) -> Record:
 
 @given(samples=st.integers(2, 60), data=st.data())
 def test_parts_put_together_are_the_whole(samples: int, data: st.DataObject) -> None:
-    """Of inputs and of a record: every series, cut at any sample."""
+    """For inputs and for a record: every series, cut at any sample."""
     cut = data.draw(st.integers(1, samples - 1))
     for whole in (inputs_of(samples), record_of(samples)):
         again = whole[:cut].followed_by(whole[cut:])

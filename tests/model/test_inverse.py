@@ -22,7 +22,7 @@ from tests.model.operators.test_every_operator import drawn_from, every_operator
 
 SPAN = Span(-100.0, 100.0)
 
-# Of the range: what simulating the inverse may miss the reference by.
+# Largest error of the simulated inverse, as a part of the range.
 CLOSE = 1e-9
 
 VALUES = {
@@ -203,7 +203,7 @@ def test_what_the_amplifier_cannot_do_is_refused_with_place_and_time(
         inverse(actuator, theta, smooth(), from_rest=True, limits=limits)
     assert "reference: " in str(refused.value)
     assert " s " in str(refused.value)
-    # What helps: with an amplifier of one sign, usually another middle.
+    # The advice: with an amplifier of one sign, usually another middle.
     for fix in ("move its middle", "smaller or smoother", "widen the limits", "`nearest=True`"):
         assert fix in str(refused.value)
 

@@ -92,7 +92,7 @@ VALUES = {
     "oscillation_cosine": -0.2,
     "oscillation_frequency": 50.0,
 }
-# What is sought for a command, or runs a sample at a time, has no more than the voltage.
+# A search for a command, or a run a sample at a time, has no more than the voltage.
 COMMANDED = tuple(name for name, stage in STAGES.items() if not stage().sees)
 UNDONE = (*COMMANDED, "heating", "delay")
 # A backlash that turns asks for a jump, which a slew rate does not let pass.

@@ -170,7 +170,7 @@ def test_reweighted_draws_are_the_closed_form_where_likelihoods_are_normal(
     result = of(truth.specimens)
     assert result.pareto_k < 0.7
     assert not any(one.normal for one in result.specimens.values())
-    # Of 1000 draws and 4000; p below 1e-4 by chance once in 10,000 runs.
+    # For 1000 draws and 4000; p below 1e-4 by chance once in 10,000 runs.
     assert stats.ks_2samp(result.mean, mean).pvalue > 1e-4
     assert stats.ks_2samp(result.spread, spread).pvalue > 1e-4
 
@@ -222,7 +222,7 @@ def with_an_outlier(
 def test_with_an_outlier_spread_and_intervals_are_right(
     moved: float, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 12 specimens one 13 spreads away, of 8 one of four or six.
+    """One of 12 specimens 13 spreads away, one of 8 four or six.
 
     In a normal population it doubles the spread. An outlier by four or six is hardly one among
     eight: it makes the spread half as large again, and its own interval covers some 85%.

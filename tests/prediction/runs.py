@@ -37,7 +37,7 @@ HEAVIEST = 10.0
 
 @dataclass(frozen=True)
 class Judged:
-    """What a run says: draws (draws, free), bands and verdicts by name."""
+    """The result of a run: draws (draws, free), bands and verdicts by name."""
 
     study: Study
     draws: FloatArray
@@ -125,7 +125,7 @@ def judge(study: Study, source: np.random.Generator, *, again: bool = True) -> J
                 )
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
-    # Of its config, validation asks what a search for stages left; here is none.
+    # Validation asks its config what a search for stages left; here is none.
     config = parse('[record]\nfile = "record.h5"', "config")
     run = Run().with_cache(study=study, config=config, flat_draws=draws)
     validation = validate_predictions(run, bands, {})

@@ -102,7 +102,7 @@ def test_intervals_of_exact_instruments_do_not(linear: Linear) -> None:
 
 @pytest.mark.slow
 def test_sampled_intervals_cover_truths_whose_scale_is_drawn() -> None:
-    """Of 600 records, simulated and sampled, each with 200 true scales.
+    """For 600 records, simulated and sampled, each with 200 true scales.
 
     A share has an error of 0.9% at most, so that one of three right ones is outside once in 14
     times, while intervals that cover 90% are found 99 times in 100.
@@ -121,7 +121,7 @@ def test_sampled_intervals_cover_truths_whose_scale_is_drawn() -> None:
         for column, (name, unit) in enumerate(units.items()):
             true = made.entry["truth"][name] * true_scales.factor(unit)
             found = np.sort(made.draws[:, column] * scales.factor(unit))
-            # Of 199 draws these hold 190 of the 200 places that a truth may have.
+            # For 199 draws these hold 190 of the 200 places that a truth may have.
             shares.append(float(np.mean((found[4] <= true) & (true <= found[194]))))
         covers.append(shares)
     assert len(covers) > 540

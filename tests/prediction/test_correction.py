@@ -71,7 +71,7 @@ def test_corrected_bands_cover_the_next_record(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_correction_counts_that_the_next_lead_in_tells_another_offset() -> None:
-    """Of a second, over which an error that forgets within 0.3 s is far from averaging out."""
+    """Windows of 1 s, over which an error that forgets within 0.3 s is far from averaging out."""
     lead_in, rng, covered = LeadIn(0.0, 1.0, 100, 0.5), np.random.default_rng(4), []
 
     def led() -> Bands:

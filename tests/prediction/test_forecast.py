@@ -180,7 +180,7 @@ def test_parameters_taken_for_known_are_noticed() -> None:
 
 @pytest.mark.slow
 def test_forecasts_from_many_posteriors_are_calibrated() -> None:
-    """Of 300 records: a coverage of 88% instead of 95 would be noticed in three of four."""
+    """With 300 records, a coverage of 88% instead of 95 would be noticed in three of four."""
     of = ranks(replicate(seed) for seed in range(1000, 1300))
     inside = {f"{at + 1} samples later": np.mean((of[:, at] > 0) & (of[:, at] < 6)) for at in AT}
     figures = {name: float(part) for name, part in inside.items()}

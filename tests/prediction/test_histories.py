@@ -251,7 +251,7 @@ def level_error(seed: int) -> tuple[float, float]:
 
 
 def test_states_between_two_histories_widen_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of eight records after any drive; without that, the planted defect, none is right.
+    """For eight records after any drive; without that, the planted defect, none is right.
 
     By chance the root-mean-square of eight errors exceeds 1.6 sds in one test of 100.
     """

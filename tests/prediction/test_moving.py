@@ -61,7 +61,7 @@ RECORDS = 200
 LIMIT = 3.0
 FALSE_ALARM = 0.01
 
-# What the 95% band of any operator covers, at least and at most.
+# Coverage of the 95% band of any operator, at least and at most.
 LEAST, MOST = 0.93, 0.97
 
 # Part of good records whose lead-in may be taken for one that does not fit.
@@ -153,7 +153,7 @@ def at_rest(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
 
 
 def test_lead_ins_that_do_not_fit_are_found() -> None:
-    """Of an actuator that moves 1.3 times as far; with a drift, a transient, a jump of 20 um."""
+    """An actuator that moves 1.3 times as far; a drift, a transient, a jump of 20 um."""
     posterior, generator = posterior_of_case(Case()), np.random.default_rng(4)
     theta = posterior.prior.theta(np.empty((20, 0)))
     for number in range(12):

@@ -1,10 +1,11 @@
 """An ordinary record gets an answer: of correct plants in motion nearly all pass, hardly one fails.
 
 A stand that the fitted model describes is recorded for 10 s at 200 Hz, between 0 and 100 V, and
-once more while its drive runs, with another offset. Nothing is said of lead-ins. Of 40 such records
-36 have to pass, and at most 1% may fail, which is none: where 97% pass in truth, 1 of 100 studies
-has fewer; where 80% do, one of 13 has as many. The twin is another actuator, with a fifth more
-gain: of 40 one may pass, as one does whose discrepancy hides it, at the limit of what may be luck.
+once more while its drive runs, with another offset. Nothing is said of lead-ins. 36 of 40 such
+records have to pass, and at most 1% may fail, which is none: where 97% pass in truth, 1 of 100
+studies has fewer; where 80% do, one of 13 has as many. The twin is another actuator, with a fifth
+more gain: of 40 one may pass, as one does whose discrepancy hides it, at the limit of what may be
+luck.
 """
 
 from collections import Counter

@@ -1,4 +1,4 @@
-"""What predictions promise: nested bands, one simulation a record, honest unknown starts."""
+"""Promises of predictions: nested bands, one simulation a record, honest unknown starts."""
 
 from dataclasses import replace
 

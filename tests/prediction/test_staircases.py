@@ -2,7 +2,7 @@
 
 The actuator creeps by as much as its draws have from the prior, which is all that a short and fast
 training record says, and its next record is a staircase that begins in a hold. All else is known,
-but for the record's start. Of an actuator that does not creep, as one in twenty-five does by the
+but for the record's start. If an actuator does not creep, as one in twenty-five does not by the
 prior of each strength, draws taken as they are have the wrong creep, and each of them the start
 that suits it: their band misses the rest of the record.
 
@@ -137,7 +137,7 @@ def test_bands_of_a_staircase_contain_an_actuator_behind_a_play() -> None:
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=400), st.integers(0, 99))
 def test_lead_in_leaves_enough_draws(logs: list[float], seed: int) -> None:
-    """Of a hundred draws or fewer all stay; of more, those of more evidence come oftener."""
+    """All of a hundred draws or fewer stay; among more, those of more evidence come oftener."""
     evidence = np.array(logs)
     rows = resample(evidence, np.random.default_rng(seed))
     times = np.bincount(rows, minlength=evidence.size)

@@ -1,4 +1,4 @@
-"""What the tests of records share: one folder for all examples, and a mark of silence."""
+"""Fixtures of the records' tests: one folder for all examples, and a mark of silence."""
 
 from pathlib import Path
 

@@ -347,7 +347,7 @@ def test_a_number_is_that_of_a_column_whatever_the_names_are(order: list[str]) -
     st.sampled_from(["V", "kV", "millivolt"]),
 )
 def test_a_number_of_units_is_a_sensitivity(number: float, form: str, unit: str, volt: str) -> None:
-    """Of a displacement in volts or counts, or an amplifier's monitor, with a sign or without."""
+    """For a displacement in volts or counts, or an amplifier's monitor, with a sign or without."""
     sensitivity = form.format(number, unit)
     units = {"displacement": sensitivity, "voltage": f"{number!r} {volt}", "time": "0.1 ms"}
     sign = -1.0 if form.startswith("-") else 1.0

@@ -45,7 +45,7 @@ def test_every_form_is_the_same_record(tmp_path: Path, name: str) -> None:
 def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
     """Without a word from the user a file is read, or one message has a guess that reads it.
 
-    What nobody can guess, a sensitivity or a rate, is left open, and refused as it is.
+    A sensitivity or a rate, which nobody can guess, is left open, and refused as it is.
     """
     written = INSTRUMENTS[name](tmp_path)
     alone, error = written._replace(columns={}, units={}, fs=None), None
@@ -63,7 +63,7 @@ def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
         record = read(Written(written.path, columns, units, fs))
         assert 600 == record.samples
         for values, right in ((record.voltage, VOLTAGE), (record.displacement, DISPLACEMENT)):
-            # Of columns without names, which of two is meant nobody can guess.
+            # Nobody can guess which of two columns without names is meant.
             assert np.corrcoef(np.asarray(values), right)[0, 1] > 0.99
         timeless = {"no times at all", "no names and no times", "numbered samples"}
         timeless |= {name for name in INSTRUMENTS if name.startswith("recorder, settings above")}
@@ -143,7 +143,7 @@ def test_times_of_day_go_on_after_midnight(folder: Path, start: int, form: str) 
 def test_dates_go_on_after_midnight_whatever_their_order(
     folder: Path, day: datetime, form: str, over_midnight: bool
 ) -> None:
-    """Of days and months; also minutes and seconds alone, as Excel writes them, after an hour."""
+    """Days and months; also minutes and seconds alone, as Excel writes them, after an hour."""
     begin = day.replace(hour=0, minute=0, second=0, microsecond=0)
     begin -= timedelta(seconds=1 * over_midnight)
     for written in (form, "{:%M:%S.%f}"):
@@ -176,7 +176,7 @@ def test_a_rate_beside_the_numbers_is_the_one_to_copy(
 def test_a_rate_among_the_attributes_is_the_one_to_copy(
     tmp_path: Path, place: str, name: str, value: float
 ) -> None:
-    """Of the file, of a group and of a dataset; none is taken from what is no rate."""
+    """Rates of the file, of a group and of a dataset; none is taken from what is no rate."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["run/u_V"], file["run/x_um"] = VOLTAGE, DISPLACEMENT
         file[place].attrs[name] = value
@@ -225,7 +225,7 @@ def test_a_rate_above_the_header_is_asked_for_unless_the_length_beside_it_is_rig
         assert ({}, 200.0) == (caught.value.guess["units"], caught.value.fs)
 
 
-# Of several tables in one file one is read, the one that is chosen; of cells what they hold
+# One of several tables in a file is read, the one that is chosen; cells give their values
 
 
 HEADERS = ("time_s,voltage_V,displacement_um", "t [s],U [V],x [um]", "Time,Drive,Pos\ns,V,um")
@@ -380,7 +380,7 @@ def test_times_are_as_fine_as_their_numbers_however_they_are_shown(
     folder: Path, shown: str, dt: float, start: float, by_python: bool
 ) -> None:
     """As 15 digits of days, or as openpyxl writes Python's times; both far below 1 ms."""
-    # Of a date 15 digits of days are 9 us.
+    # 15 digits of a date's days are 9 us.
     assume(by_python or shown != "date" or dt > 2e-5)
     book = Workbook()
     book.active.append(["Time", "U [V]", "x [um]"])

@@ -145,7 +145,7 @@ def test_decimate_refuses_what_is_no_number_of_samples(factor: int) -> None:
         ramp().decimate(factor)
 
 
-# What is written is what is read: through every format, in every unit, to the last bit
+# A written record is read as it was: through every format, in every unit, to the last bit
 
 
 SUFFIXES = ("csv", "txt", "h5", "hdf5", "mat", "mat 7.3")

@@ -484,7 +484,7 @@ def test_each_number_may_have_its_unit_behind_it(
     rule: bool,
     missing: set[int],
 ) -> None:
-    """Whatever separates them, with decimal points or commas, and where readings are missing."""
+    """With any separator, decimal points or commas, and where readings are missing."""
     rows = []
     for number, row in enumerate(ROWS):
         cells = [

@@ -270,7 +270,7 @@ def test_a_gap_in_a_smooth_output_is_bridged_right_and_another_refused(
 ) -> None:
     """Wherever it is in a sine, with noise and other samples missing too: to 1.5% of the range.
 
-    Of a dozen samples a period or more, up to a quarter of it is bridged, and half is refused.
+    With a dozen samples a period or more, a quarter of it is bridged, and half is refused.
     """
     rng = np.random.default_rng(missing)
     lost = {*range(1000, 1000 + missing), *rng.integers(1, 1999, others).tolist()}

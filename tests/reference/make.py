@@ -35,7 +35,7 @@ from tests.reference.plain import (
 RUNS = MappingProxyType({"virtual": 2, "measured": 4})
 LIVE = 500
 WALKS = 60
-# Of each run.
+# For each run.
 EFFECTIVE = 10_000
 MOST_CALLS = 12_000_000
 

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 FOLDER = Path(__file__).resolve().parent
 
-# Not part of the project; it lies beside the repository, or what needs it is left out.
+# It is no part of the project, but lies beside the repository, or what needs it is left out.
 MEASURED = FOLDER.parents[2] / "shared" / "data" / "picma_stack_open_loop.csv"
 
 MODEL = ("d", "alpha", "beta", "gamma", "exponent", "initial")

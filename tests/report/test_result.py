@@ -124,7 +124,7 @@ def tables(draw: st.DrawFn) -> Table:
 def test_every_table_is_shown_whole_at_every_width(table: Table, width: int) -> None:
     lines = as_text(Report(title="", blocks=[table]), width).splitlines()
     assert max(map(len, lines)) <= width
-    # Of wrapped texts the letters are all there, once; those of the rows' names in every part.
+    # All letters of wrapped texts are there, once; those of the rows' names in every part.
     shown, named = "".join(lines), 0
     parts = max(shown.count("─") // max(line.count("─") for line in lines), 1)
     for number, column in enumerate(zip(table.columns, *table.rows, strict=True)):

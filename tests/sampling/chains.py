@@ -19,7 +19,7 @@ ATTRIBUTES: dict[str, str | int] = {
     "platform": "Linux",
     "seed": 7,
 }
-# What a writer does, in order, and where it may be interrupted.
+# The steps of a writer, in order, and where it may be interrupted.
 PLAN: tuple[tuple[Phase, int], ...] = (("pilot", 2), ("tuning", 2), ("sampling", 10))
 
 

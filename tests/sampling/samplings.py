@@ -38,7 +38,7 @@ def run(
 
 
 class Watched:
-    """What a watcher hears."""
+    """The calls of a watch."""
 
     def __init__(self) -> None:
         self.blocks: list[Phase] = []

@@ -1,4 +1,4 @@
-"""What has not converged is never called so, and what has is.
+"""A chain that has not converged is never called so, and one that has is.
 
 The hard cases are chains broken in one way each (:mod:`tests.sampling.hard_chains`), judged with a
 target of one effective draw, so that no large target hides a fault that the other criteria miss;

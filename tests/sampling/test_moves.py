@@ -112,7 +112,7 @@ def test_a_step_to_one_of_several_places_and_its_way_back_are_in_balance(logs: l
 @pytest.mark.parametrize("ahead", [1, 4])
 @pytest.mark.parametrize("blobs_dtype", [None, [("first", float), ("both", float, (2,))]])
 def test_a_blob_goes_with_its_place(ahead: int, tries: int, blobs_dtype: Any) -> None:
-    """What emcee stores beside each place is what the density returned there."""
+    """The blobs that emcee stores are those that the density returned there."""
     known = TARGETS["banana"]
 
     def density(x: FloatArray) -> tuple[float, ...]:
@@ -135,7 +135,7 @@ def test_a_blob_goes_with_its_place(ahead: int, tries: int, blobs_dtype: Any) ->
 
 @pytest.mark.parametrize("walkers", [12, 20])
 def test_a_move_serves_another_sampler(walkers: int) -> None:
-    """Of as many walkers or others, from where the first ended: nothing is left of its density."""
+    """With any number of walkers, from where the first ended: its density is forgotten."""
     known = TARGETS["banana"]
     move = IndependenceMove(fitted("banana"), ahead=4)
 

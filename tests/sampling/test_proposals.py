@@ -100,7 +100,7 @@ def test_components_of_hardly_any_draws_give_no_nan(name: str) -> None:
     assert np.isfinite(mixture.log_density(TINY[name])).all()
     proposed, log_density = mixture.evaluate(mixture.draw(np.random.RandomState(14), 500))
     assert np.isfinite(log_density).all()
-    # Of units far apart rounding leaves less.
+    # With units far apart, rounding leaves fewer digits.
     np.testing.assert_allclose(mixture.log_density(proposed), log_density, atol=1e-3)
 
 
@@ -247,7 +247,7 @@ def test_places_on_a_ridge_are_taken_several_times_as_often(power: int) -> None:
 
 
 def test_longer_tails_and_widths_are_proposed_as_often_as_they_are() -> None:
-    """Of twelve fits to 2,000 draws each: how many places are taken, and for how long one rests.
+    """For twelve fits to 2,000 draws each: how many places are taken, and for how long one rests.
 
     The longest rests are those at the thousandth of all places that is proposed least: in half the
     fits they are half as long as without maps.

@@ -46,7 +46,7 @@ def places(posterior: Posterior, generator: np.random.Generator, count: int) -> 
 
 @given(st.integers(0, 10**6), st.sampled_from([40, 30_000]))
 def test_it_is_undone_and_tells_how_much_it_stretches(seed: int, readings: int) -> None:
-    """Of a long record, too, whose levels are those of a thinned one."""
+    """A long record's, too, whose levels are those of a thinned one."""
     posterior = linear_actuator(1, readings=readings)
     generator = np.random.default_rng(seed)
     reference, *bent = places(posterior, generator, 4)

@@ -122,7 +122,7 @@ DAMAGES: dict[str, Callable[[bytes, np.random.Generator], bytes]] = {
 def test_what_comes_before_a_damage_is_used_and_resuming_makes_the_rest_again(
     whole: Path, tmp_path: Path, kind: str
 ) -> None:
-    """Of 20 damages each; a bit may lie where it does not matter. Either way it says so."""
+    """With 20 damages each; a bit may lie where it does not matter. Either way it says so."""
     source, files = np.random.default_rng(1), files_of(whole)
     expected, harmless = arrays(ChainFile.read(whole)), 0
     for trial in range(20):
@@ -205,7 +205,7 @@ def test_a_reader_meets_whole_blocks_alone_while_another_writes(tmp_path: Path) 
 
 
 def test_emcee_opens_each_ensemble_during_a_run_and_after_it_and_goes_on(tmp_path: Path) -> None:
-    """What it reads is what counts so far; its own sampler continues from there."""
+    """It reads the draws that count so far; its own sampler continues from there."""
     chain = new(tmp_path / "chain")
     finish(chain)
     chain.fall_back(1)  # of the sampling, which counts no longer

@@ -129,9 +129,9 @@ class _Source(ConfigTable):
     where they are called otherwise { temperature_degC = "T2" }.
     """
     input: str | None = key(None, example='"H (A/m)"')
-    """What drives, where it is no voltage in V: its name, and the unit of all numbers."""
+    """The input, where it is no voltage in V: its name, and the unit of all numbers."""
     output: str | None = key(None, example='"B (T)"')
-    """What is measured, where it is no displacement in um."""
+    """The output, where it is no displacement in um."""
     linearity: str | None = key(None, example='"0.1 %"')
     """The sensor's largest departure from a straight line, of the range."""
     missing: list[float] | None = key(None, unit="um", example="[-20.0, 20.0]", called="na clipped")
@@ -239,8 +239,8 @@ class ModelConfig(ActuatorConfig):
     is a command (auto).
     """
     history: Literal["unknown", "demagnetized"] = key("unknown", example='"demagnetized"')
-    """What the hysteresis has been through before the record: any drive over the record's voltages
-    (unknown), or a voltage straight from 0 V after demagnetization; dynamics may still be moving.
+    """The drive before the record: any over the record's voltages (unknown), or a voltage
+    straight from 0 V after demagnetization; dynamics may still be moving.
     """
     search: Duration = key("60s", example='"none"', called="improve")
     """Longest time of the search for stages, as in 60s or 2min; none: no search."""
@@ -331,14 +331,14 @@ class ParameterConfig(ConfigTable):
 
 
 class CertificateConfig(ConfigTable):
-    """What a certificate says of the measurement, as it was."""
+    """A measurement for a certificate: its object, conditions and instruments."""
 
     number: str | None = key(None, example='"2026-114"')
     """The certificate's number."""
     laboratory: str | None = key(None, example='"Precision Lab, room 3"')
     """Who measured."""
     object: str | None = key(None, example='"stack P-885.51, serial 0917"', called="specimen")
-    """What was measured."""
+    """The object that was measured."""
     conditions: str | None = key(None, example='"(23.0 +- 0.2) degC, unloaded, after 30 min"')
     """Under which conditions."""
     instruments: Texts = key([], example='["capacitive sensor CS1, calibrated 2026-03-02"]')
@@ -449,7 +449,7 @@ class Config(ConfigTable):
     validation: dict[Name, ValidationConfig] = key({}, called="holdout test")
     """Data to predict and judge, under a NAME of your choice."""
     certificate: CertificateConfig = key(CertificateConfig())
-    """What a certificate says of the measurement."""
+    """The measurement as a certificate describes it."""
     truth: dict[str, float] = key({}, unit="the parameter's", example="{ d = 0.7, alpha = 0.3575 }")
     """True parameters of a simulated record, to be shown beside the estimates."""
 

@@ -42,7 +42,7 @@ class ConfigProposal:
 
     ``text`` is the config in TOML with comments, ``config`` what it says, and the remarks on the
     record. ``findings`` are what is wrong with the record, ``remarks`` what was said when it was
-    read. Whoever goes on with the ``config`` need not read the ``record`` again.
+    read. The ``config`` can be used without reading the ``record`` again.
     """
 
     text: str

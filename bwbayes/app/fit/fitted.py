@@ -110,7 +110,7 @@ class Run(Shown):
 
     @cached_property
     def _resolved(self) -> Run:
-        """What the config and the records in its folder describe."""
+        """The run that the config and the records in its folder describe."""
         from bwbayes.app.config.config import load
         from bwbayes.app.study.resolve import resolve_config
 

@@ -6,11 +6,12 @@ the same bits; if the scheduler itself is gone, what is on disk can be resumed a
 products here are small and the ensembles already share the cores, so the linear algebra library is
 kept to one thread: more would only wait for each other, and could change the last bits.
 
-What a page shows is drawn in a process beside this one, if possible. That process compiles what
-every likelihood needs while this one loads what samples, and compiles what simulates while this one
-compiles the rest of the likelihood; it loads what draws after that, or before if all is compiled.
-It begins with each picture as soon as what it shows is known: the draws before predictions are
-made, the bands before they are judged. The pictures are the same as drawn in one process.
+The figures of a page are drawn in a process beside this one, if possible. That process compiles
+what every likelihood needs while this one loads what samples, and compiles what simulates while
+this one compiles the rest of the likelihood; it loads what draws after that, or before if all is
+compiled. It begins with each picture as soon as what it shows is known: the draws before
+predictions are made, the bands before they are judged. The pictures are the same as drawn in one
+process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What records and runs are like, for people: facts, findings, and remarks, a line each."""
+"""Facts, findings and remarks on records and runs, for people, a line each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a config describes: records, windows, parameters, the virtual stand, the sampling.
+"""From a config to a study: records, windows, parameters, the virtual stand, the sampling.
 
 The records of a config: from files or the virtual stand, joined, cut, split and looked at.
 

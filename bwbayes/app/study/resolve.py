@@ -61,7 +61,7 @@ def resolve_models(
 ) -> dict[str, Run]:
     """Make a run of a config with each of several models, by name; its records are read once.
 
-    What the config says of parameters counts for the models that have them.
+    Statements of the config about parameters count for the models that have them.
     """
     runs = {}
     with _quantities(config, records).spoken():

@@ -1,7 +1,7 @@
 """Recognition of the quantity of a file's series by its name, unit and numbers.
 
 Units are those of the SI with any prefix, some others, and multiples of them: a multiple of a unit
-is a sensor's sensitivity. What is not recognized is asked for, all at once and with a guess. Some
+is a sensor's sensitivity. The user is asked for the others, all at once and with a guess. Some
 programs write a column of times for each channel: in the series' group of the file or, in a text,
 in the last column of times before it. Where the times of voltage and displacement differ, each gets
 a clock.

@@ -167,7 +167,7 @@ def test_a_sharp_loop_stays_below_its_ceiling(gamma: float) -> None:
     assert (np.abs(h).max(axis=1) <= alpha / gamma * (1 + 1e-11)).all()
 
 
-# What passes for an energy, h²/(2 α), never grows by more than is supplied.
+# The stand-in for an energy, h²/(2 α), never grows by more than is supplied.
 signs = st.floats(-0.6, 0.6)
 
 

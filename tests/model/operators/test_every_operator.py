@@ -1,4 +1,4 @@
-"""What is promised of every operator in the registry, and of one from outside the package."""
+"""Promises of every operator in the registry, and of one from outside the package."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -221,7 +221,7 @@ def of_state(name: str, size: int, seed: int) -> dict[str, FloatArray]:
 
 @pytest.mark.parametrize("name", OPERATORS)
 def test_a_minor_loop_is_not_forgotten_and_not_congruent(name: str) -> None:
-    """What a Preisach model would do, none of these does: neither wiping out nor congruency."""
+    """None of these does what a Preisach model would: neither wiping out nor congruency."""
     operator, column = OPERATORS[name], of_state(name, 100, 5)
     column["initial"] = np.zeros_like(column["initial"])
     straight = run(operator, column, np.array([0.0, 40.0, 60.0]))

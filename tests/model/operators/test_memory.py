@@ -231,7 +231,7 @@ def test_the_start_goes_from_the_ascending_to_the_descending_branch(
 def test_a_demagnetized_actuator_came_straight_from_zero_volts(
     case: Case, voltage: FloatArray
 ) -> None:
-    """Whatever ``initial`` is: as a record whose first sample is at zero volts goes on."""
+    """At any ``initial``: as a record whose first sample is at zero volts goes on."""
     span = Span(-200.0, 200.0)
     actuator = Actuator("none", hysteresis=case.operator, span=span, demagnetized=True)
     column = {**case.column, "offset": np.zeros(len(INITIALS))}
