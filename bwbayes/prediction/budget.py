@@ -89,7 +89,7 @@ class Budget:
 def loop_width(posterior: Posterior, draws: FloatArray) -> Measurand:
     """Return the largest width of the loop over the records' range of draws (draws, free)."""
     measured = measures(steady_loop(*driven(posterior, draws)))
-    extent, percent = measured["range_um"], measured["widest_percent"]
+    extent, percent = measured["range_um"], measured["max_width_percent"]
     assert extent is not None
     assert percent is not None
     return Measurand("max loop width", "um", np.abs(extent) * percent / 100)

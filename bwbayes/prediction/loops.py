@@ -35,8 +35,8 @@ POINTS = 201
 # Measures of a loop: their names in a summary, titles and units for people.
 MEASURES: Mapping[str, tuple[str, str]] = {
     "range_um": ("Range", "um"),
-    "opening_um": ("Opening at zero voltage", "um"),
-    "widest_percent": ("Widest opening, of the range", "%"),
+    "width_at_zero_um": ("Loop width at zero voltage", "um"),
+    "max_width_percent": ("Hysteresis (max loop width), of the range", "%"),
     "remanence_um": ("Remanence", "um"),
     "coercive_V": ("Coercive voltage", "V"),
     "area_um_V": ("Area", "um V"),
@@ -265,14 +265,14 @@ def measures(traced: TracedLoop) -> dict[str, FloatArray | None]:
 
     ``range_um``
         x₊ − x₋.
-    ``opening_um``
+    ``width_at_zero_um``
         x↓(0) − x↑(0), positive where the displacement lags behind the voltage; None if the loop
         does not go through zero volts.
-    ``widest_percent``
+    ``max_width_percent``
         The largest x↓ − x↑ at one voltage as a part of the range: what data sheets call hysteresis.
     ``remanence_um``
         x↓(0) − x_m: what remains at zero volts after the highest voltage, against the middle; half
-        of the opening in a loop that is symmetric about zero.
+        of the width in a loop that is symmetric about zero.
     ``coercive_V``
         (u↑ − u↓) / 2, with u↑ and u↓ the voltages at which x↑ and x↓ pass the middle x_m: half of
         the loop's width there. In a loop that is symmetric about zero it is the voltage that takes
@@ -295,8 +295,8 @@ def measures(traced: TracedLoop) -> dict[str, FloatArray | None]:
     about_zero = through_zero and bool(np.nanmean(down) <= 0 <= np.nanmean(up))
     return {
         "range_um": size,
-        "opening_um": _at_zero(voltage, gap) if through_zero else None,
-        "widest_percent": 100 * np.max(gap, axis=1) / np.abs(size),
+        "width_at_zero_um": _at_zero(voltage, gap) if through_zero else None,
+        "max_width_percent": 100 * np.max(gap, axis=1) / np.abs(size),
         "remanence_um": _at_zero(voltage, falling) - middle if about_zero else None,
         "coercive_V": (up - down) / 2 if about_zero else None,
         "area_um_V": np.asarray(scipy.integrate.simpson(gap, x=voltage, axis=1)),

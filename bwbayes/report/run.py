@@ -292,9 +292,9 @@ SCORE_TERMS = {
 }
 
 LOOP_TERMS = {
-    "Opening at zero voltage": "Displacement with falling less that with rising voltage, at 0 V.",
-    "Widest opening": "The largest such difference at any voltage, as a part of the range: what "
-    "data sheets call hysteresis.",
+    "Loop width at zero voltage": "Displacement with falling minus that with rising voltage.",
+    "Hysteresis (max loop width)": "The largest such difference at any voltage, as a part of the "
+    "range, as in data sheets.",
     "Remanence": "Displacement left at 0 V after the highest voltage, against the middle between "
     "the loop's ends.",
     "Coercive voltage": "Half of the loop's width in voltage where the displacement passes that "

@@ -43,13 +43,13 @@ def test_plays_are_measured_as_in_a_slow_loop(low: float, high: float) -> None:
     middle = (rising[-1] + falling[0]) / 2
     expected = {
         "range_um": rising[-1] - rising[0],
-        "widest_percent": 100 * np.max(falling - rising) / (rising[-1] - rising[0]),
+        "max_width_percent": 100 * np.max(falling - rising) / (rising[-1] - rising[0]),
     }
     cycle = np.concatenate([u, u[::-1]]), np.concatenate([rising, falling[::-1]])
     forward = cycle[0] * np.roll(cycle[1], -1) - np.roll(cycle[0], -1) * cycle[1]
     expected["area_um_V"] = np.sum(forward) / 2
     if low < 0:
-        expected["opening_um"] = np.interp(0.0, u, falling - rising)
+        expected["width_at_zero_um"] = np.interp(0.0, u, falling - rising)
     if low == -high:
         expected["remanence_um"] = np.interp(0.0, u, falling) - middle
         passing = [np.interp(middle, branch, u) for branch in (rising, falling)]
@@ -84,7 +84,7 @@ def test_loops_are_those_of_the_whole_range_and_of_half_of_it() -> None:
 def test_remanence_and_coercive_voltage_are_of_loops_about_zero_volts(
     shift: float, about_zero: bool
 ) -> None:
-    """Elsewhere they have no number, no row and no term; an opening is where the loop has zero."""
+    """Elsewhere they have no number, no row and no term; a width is where the loop has zero."""
     of, draws = problem("bouc-wen")
     # Over 200 V, with a coercive voltage of some 10 V.
     voltage = 100 * of.single_record.voltage / np.max(np.abs(of.single_record.voltage))
@@ -94,7 +94,7 @@ def test_remanence_and_coercive_voltage_are_of_loops_about_zero_volts(
             assert (loop.estimates[name] is not None) == about_zero
     titles = [row[0] for row in loops_table(loops).rows]
     assert ("Remanence" in titles, "Coercive voltage" in titles) == (about_zero, about_zero)
-    assert ("Opening at zero voltage" in titles) == (shift < 100)
+    assert ("Loop width at zero voltage" in titles) == (shift < 100)
 
 
 def test_initial_curve_starts_at_zero_volts_and_ends_where_the_voltage_does() -> None:
