@@ -227,7 +227,7 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     }
     posterior = experiment.posterior.with_readings(readings)
     if experiment.around is not None:
-        posterior = _together(experiment.posterior, posterior)
+        posterior = experiment.posterior.with_readings_of(posterior)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
     names, truth = experiment.statistics, experiment.measures(posterior, true)[0]
     entry = Entry(
@@ -348,12 +348,6 @@ def _predictions(
         predicted = predict_record(*alone, record, other.start, others, window=other.judged)
         predictions[name] = [(predicted, another, window)]
     return predictions
-
-
-def _together(posterior: Posterior, replicated: Posterior) -> Posterior:
-    """Return the posterior of its own readings and of replicated ones: the same parameters."""
-    datasets = posterior.datasets + replicated.datasets
-    return replace(posterior, datasets=datasets, joint=posterior.table)
 
 
 def _simulated_other(

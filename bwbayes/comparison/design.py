@@ -25,7 +25,7 @@ from typing import ClassVar, overload
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED
 from bwbayes.diagnosis.rivals import DRAWS, Rival, close_rivals
 from bwbayes.diagnosis.validation import ValidationSummary
@@ -477,16 +477,17 @@ def rank_designs(
             scores.append(DesignScore(name, np.nan, np.nan, refused))
             continue
         planned, remaining = Target(_planned(posterior, voltage)), []
+        rows, unknown = (np.searchsorted(planned.physical, c) for c in (columns, new))
         this = part(watch, number / count, (number + 1) / count)
         for batch in watched([*batches(len(chosen), 2 * len(scopes) * voltage.size)], this):
             informations = planned.linearize(chosen[batch], expected=True).fisher_information
-            for gradient, variance, full_information in zip(
+            for gradient, variance, full in zip(
                 gradients[batch], unread[batch], informations, strict=True
             ):
-                information = _left_open(
-                    full_information,
-                    *(np.searchsorted(planned.physical, c) for c in (columns, new)),
-                )
+                # The unknowns of its own, with standard normal priors, are integrated out.
+                across = full[np.ix_(rows, unknown)]
+                start = full[np.ix_(unknown, unknown)] + np.eye(unknown.size)
+                information = full[np.ix_(rows, rows)] - across @ np.linalg.solve(start, across.T)
                 # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
                 inner = np.eye(len(factor)) + factor.T @ information @ factor
                 after = factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos")
@@ -504,17 +505,6 @@ def _planned(posterior: Posterior, voltage: FloatArray) -> Posterior:
     """
     nothing, windows = np.zeros(voltage.size), (slice(0, voltage.size),)
     return posterior.altered(voltage=voltage, displacement=nothing, training=windows)
-
-
-def _left_open(information: FloatArray, columns: IntArray, new: IntArray) -> FloatArray:
-    """Return a record's information about ``columns``, its ``new`` unknowns integrated out.
-
-    These have standard normal priors.
-    """
-    across = information[np.ix_(columns, new)]
-    start = information[np.ix_(new, new)] + np.eye(new.size)
-    remaining: FloatArray = information[np.ix_(columns, columns)]
-    return remaining - across @ np.linalg.solve(start, across.T)
 
 
 def _mean_sd(gradient: FloatArray, variance: FloatArray, covariance: FloatArray) -> float:

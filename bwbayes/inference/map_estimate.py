@@ -106,7 +106,15 @@ def fit(
         point = fit(short, generator, part(watch, 0.0, 0.5))
         spread, places = point.prior_covariance, [*point.optima]
         if thinned is not posterior:
-            places = _unthinned(posterior, thinned, point, generator)
+            # Thinning changes displacement and noise, and moves the modes by far more than a long
+            # record leaves open: readings with the residuals of the whole one lead to its modes.
+            prior = posterior.prior
+            theta = prior.theta(prior.constrain(point.mode[np.newaxis])[0])
+            target = Target(with_residuals_of(thinned, posterior, theta))
+            first = beginning(posterior, SAMPLES)
+            noise = prior.unconstrain(prior.draw(generator, DRAWS))[:, target.noise]
+            climbed = [climb(target, place[np.newaxis]).coordinates for place in places]
+            places = [_with_noise(first, place, noise, generator) for place in climbed]
         for start_point in watched(places, part(watch, 0.5, 1.0)):
             _add_mode(posterior, modes, start_point)
     for start_point in further:
@@ -223,24 +231,6 @@ def _add_mode(
         start, (covariance, _) = state.coordinates, target.covariance(state)
     modes.append(refine(posterior, start, covariance))
     modes.sort(key=lambda mode: -mode.log_density)
-
-
-def _unthinned(
-    posterior: Posterior, thinned: Posterior, point: MAPEstimate, generator: np.random.Generator
-) -> list[FloatArray]:
-    """Return places (free,) near the modes of a posterior, from a point fit of a thinned one.
-
-    Thinning changes displacement and noise, and moves the modes by far more than a long record
-    leaves open. So places are climbed to from readings that have the residuals of the whole record,
-    and get the noise of its beginning.
-    """
-    prior = posterior.prior
-    theta = prior.theta(prior.constrain(point.mode[np.newaxis])[0])
-    target = Target(with_residuals_of(thinned, posterior, theta))
-    first = beginning(posterior, SAMPLES)
-    noise = prior.unconstrain(prior.draw(generator, DRAWS))[:, target.noise]
-    climbed = (climb(target, optimum[np.newaxis]).coordinates for optimum in point.optima)
-    return [_with_noise(first, position, noise, generator) for position in climbed]
 
 
 def _zero_noise_starts(

@@ -190,11 +190,16 @@ class JointPrior:
         self._formulas = rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
         self._cut = [(row, self.free[row]) for row, f in forms.items() if f is None]
         # Parameters whose coordinates are those of a sum, and the rows of the others in it.
-        self._sums = [
-            (row, form, others)
-            for row, form in forms.items()
-            if form is not None and not form.logarithmic and (others := self._summed_with(row))
-        ]
+        self._sums = []
+        for row, form in forms.items():
+            parameter = self.free[row]
+            others = [
+                other
+                for other, p in enumerate(self.free)
+                if p.plain in parameter.declared.summed_with and p.record in ("", parameter.record)
+            ]
+            if others and form is not None and not form.logarithmic:
+                self._sums.append((row, form, others))
         # Values that free parameters must exceed, or reach: two columns.
         floors = np.array([p.floor for p in self.free])[:, np.newaxis]
         reaches = [p.declared.reaches_floor for p in self.free]
@@ -218,15 +223,6 @@ class JointPrior:
                 )
         if not np.all(self._possible(fixed)):
             raise InputError(f"priors: fixed values must have {self._stated()}")
-
-    def _summed_with(self, row: int) -> list[int]:
-        """Return the rows of the free parameters in whose sum a record shows a free one."""
-        parameter = self.free[row]
-        return [
-            other
-            for other, p in enumerate(self.free)
-            if p.plain in parameter.declared.summed_with and p.record in ("", parameter.record)
-        ]
 
     def _stated(self) -> str:
         """Return the physical constraints in words."""

@@ -242,6 +242,10 @@ class Posterior:
         )
         return replace(self, datasets=tuple(datasets))
 
+    def with_readings_of(self, other: Posterior) -> Posterior:
+        """Return the posterior of its own readings and of another's, with the same parameters."""
+        return replace(self, datasets=self.datasets + other.datasets, joint=self.table)
+
     def without(self, rows: Mapping[str, IntArray]) -> Posterior:
         """Return the posterior without the readings of some samples of its records, by name."""
         displacements = {dataset.name: dataset.displacement.copy() for dataset in self.datasets}

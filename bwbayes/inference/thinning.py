@@ -73,7 +73,11 @@ def thin(dataset: Likelihood, stride: int) -> Likelihood:
     """
     if stride == 1:
         return dataset
-    voltage = _with_reversals(dataset.voltage, stride)
+    voltage = dataset.voltage[::stride].copy()
+    for branch in [*monotone_stretches(voltage)][:-1]:
+        place = stride * branch.last
+        nearby = dataset.voltage[max(place - stride + 1, 0) : place + stride]
+        voltage[branch.last] = nearby.max() if branch.direction > 0 else nearby.min()
     inputs = replace(dataset.inputs[::stride], voltage=voltage, voltage_is="output")
     actuator = replace(
         dataset.actuator.within(dataset.voltage), hold=inputs.hold, interval=inputs.interval
@@ -112,16 +116,6 @@ def stride_of(short: Posterior, whole: Posterior) -> int:
 def thin_windows(windows: Iterable[slice], stride: int) -> tuple[slice, ...]:
     """Return where windows of a record (slices of its samples) are in a thinned one."""
     return tuple(slice(-(-w.start // stride), -(-w.stop // stride)) for w in windows)
-
-
-def _with_reversals(voltage: FloatArray, stride: int) -> FloatArray:
-    """Take every ``stride``-th voltage; where these turn, the extreme of all voltages nearby."""
-    result = voltage[::stride].copy()
-    for branch in list(monotone_stretches(result))[:-1] if stride > 1 else ():
-        position = stride * branch.last
-        nearby = voltage[max(position - stride + 1, 0) : position + stride]
-        result[branch.last] = nearby.max() if branch.direction > 0 else nearby.min()
-    return result
 
 
 def displacement(posterior: Posterior, dataset: Likelihood, theta: FloatArray) -> FloatArray:

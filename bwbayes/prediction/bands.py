@@ -473,14 +473,23 @@ def _worst_second(hits: BoolArray, scored: BoolArray, interval: float) -> float:
 
 
 def correct(bands: Bands) -> Correction:
-    """Return the correction of a 95% sensor band from its readings after ``scored_from``."""
+    """Return the correction of a 95% sensor band from its readings after ``scored_from``.
+
+    Each window is cut into blocks that are as long as the residual remembers, or longer.
+    """
     assert bands.measured is not None
     scored = bands.scored(bands.measured)
     residual = np.where(scored, bands.measured - bands.mean, 0.0)
     edges = [edge["sensor", 95] - bands.mean for edge in (bands.lower, bands.upper)]
 
     length = math.ceil(residual_memory(residual / np.maximum(bands.sd("sensor"), 1e-150), scored))
-    blocks = _blocks(bands, scored, length)
+    blocks: list[IntArray] = []
+    for window in bands.windows:
+        rows = np.arange(max(window.start, bands.scored_from), window.stop)
+        count = rows.size // length
+        if count:
+            blocks += [block[scored[block]] for block in np.array_split(rows, count)]
+    blocks = [block for block in blocks if block.size]
     block_s = length * bands.interval
     least = 20
     if len(blocks) < least:
@@ -543,13 +552,3 @@ def residual_memory(z: FloatArray, scored: BoolArray) -> float:
     sums = correlation.reshape(-1, 2).sum(axis=1)
     last = int(np.argmax(sums <= 0)) if (sums <= 0).any() else sums.size
     return max(float(2 * np.sum(np.minimum.accumulate(sums[:last])) - 1), 1.0)
-
-
-def _blocks(bands: Bands, scored: BoolArray, length: int) -> list[IntArray]:
-    """Cut windows into blocks of ``length`` samples or more; return each one's scored samples."""
-    blocks: list[IntArray] = []
-    for window in bands.windows:
-        rows = np.arange(max(window.start, bands.scored_from), window.stop)
-        if count := rows.size // length:
-            blocks += [block[scored[block]] for block in np.array_split(rows, count)]
-    return [block for block in blocks if block.size]

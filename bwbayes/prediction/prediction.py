@@ -231,7 +231,13 @@ def predict_record(
     """
     predicted_window = slice(0, record.samples) if window is None else record.window_slice(*window)
     theta = posterior.prior.theta(draws)
-    record = _known(record, posterior, theta, from_rest=start.from_rest)
+    if record.displacement is not None:
+        # Only those readings count that the draws can follow.
+        actuator = replace(posterior.single_record.actuator, interval=record.interval)
+        model = posterior.single_record.table.actuator(theta)
+        known = actuator.known(model, record.displacement, from_rest=start.from_rest)
+        if known is not record.displacement:
+            record = replace(record, displacement=known)
     start_states = estimate_initial_states(
         posterior, theta, record, start, generator, part(watch, 0.0, STATES_SHARE)
     )
@@ -256,16 +262,6 @@ def predict_record(
         separate=True,
         model_error_sd=model_error_sd,
     )
-
-
-def _known(record: Record, posterior: Posterior, theta: FloatArray, *, from_rest: bool) -> Record:
-    """Return a record with those of its readings that draws θ (draws, parameters) can follow."""
-    if record.displacement is None:
-        return record
-    actuator = replace(posterior.single_record.actuator, interval=record.interval)
-    model = posterior.single_record.table.actuator(theta)
-    known = actuator.known(model, record.displacement, from_rest=from_rest)
-    return record if known is record.displacement else replace(record, displacement=known)
 
 
 def _bands(

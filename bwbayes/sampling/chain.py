@@ -309,7 +309,17 @@ class ChainFile(Chain):
         start |= {f"point_{field.name}": getattr(point, field.name) for field in fields(point)}
         for name in (field.name for field in fields(EnsembleState)):
             start[name] = np.stack([getattr(state, name) for state in chain.starts])
-        _create_folder(path, {"start": start})
+        # The folder is there whole or not at all.
+        draft = path.with_suffix(".partial")
+        shutil.rmtree(draft, ignore_errors=True)
+        try:
+            draft.mkdir()
+            _write(draft, "start", start)
+            draft.rename(path)
+        except OSError as error:
+            raise _not_written(path, error) from None
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
         return created
 
     @classmethod
@@ -512,21 +522,6 @@ def _write(folder: Path, name: str, arrays: Arrays) -> None:
     except OSError as error:
         draft.unlink(missing_ok=True)
         raise _not_written(folder, error) from None
-
-
-def _create_folder(path: Path, files: Mapping[str, Arrays]) -> None:
-    """Write a folder of files, whole or not at all."""
-    draft = path.with_suffix(".partial")
-    shutil.rmtree(draft, ignore_errors=True)
-    try:
-        draft.mkdir()
-        for name, arrays in files.items():
-            _write(draft, name, arrays)
-        draft.rename(path)
-    except OSError as error:
-        raise _not_written(path, error) from None
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def _block_name(phase: Phase, number: int) -> str:

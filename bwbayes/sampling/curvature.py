@@ -93,7 +93,9 @@ class PolynomialMap:
         u = np.linalg.solve(factor, (draws - center).T).T
         near = _near(u)
         lengths = np.abs(np.diagonal(triangle))[: near.shape[1] - 1] / np.sqrt(count)
-        terms = _largest_terms(lengths, min(count // 50, TERMS))
+        terms = np.array([*combinations_with_replacement(range(-1, len(lengths)), DEGREE)])
+        sizes = np.append(np.minimum(lengths, 1.0), 1.0)[terms].prod(axis=1)
+        terms = terms[np.argsort(-sizes, kind="stable")[: min(count // 50, TERMS)]]
         products = _products(near, terms)
         halves = [
             _Regression.of(products[rows], u[rows])
@@ -354,13 +356,6 @@ def _near(u: FloatArray) -> FloatArray:
     """Return c (count, twelve at most) of u (count, free), and a column of ones at the end."""
     near = np.clip(u[:, :LONGEST], -FARTHEST, FARTHEST)
     return np.column_stack([near, np.ones(len(u))])
-
-
-def _largest_terms(lengths: FloatArray, count: int) -> IntArray:
-    """Return ``count`` terms (count, 4), largest first, of coordinates that have these lengths."""
-    terms = np.array([*combinations_with_replacement(range(-1, len(lengths)), DEGREE)])
-    sizes = np.append(np.minimum(lengths, 1.0), 1.0)[terms].prod(axis=1)
-    return terms[np.argsort(-sizes, kind="stable")[:count]]
 
 
 class _Regression(NamedTuple):

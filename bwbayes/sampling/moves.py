@@ -111,7 +111,10 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
         if not self._drawn:
             self._drawn = [*self._draw(model, walkers)]
         tries = self._drawn.pop(0)
-        here = self._log_weight(state)
+        if self._left is not None and np.array_equal(self._left[0], state.coords):
+            here = self._left[1]  # log w₀ of walkers as this move left them
+        else:
+            here = state.log_prob - self.proposal.log_density(state.coords)
         which, accepted, log_weight = self.choose(
             here, tries.log_weight, model.random.rand(walkers)
         )
@@ -144,13 +147,6 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
         others = ends[-1] - share + np.exp(here - largest)
         accepted = (point - (ends[which, rows] - share)) * others < share * ends[-1]
         return which, accepted, chosen
-
-    def _log_weight(self, state: emcee.State) -> FloatArray:
-        """Return log w₀ (walkers,), which is known if the walkers are as this move left them."""
-        if self._left is not None and np.array_equal(self._left[0], state.coords):
-            return self._left[1]
-        log_weight: FloatArray = state.log_prob - self.proposal.log_density(state.coords)
-        return log_weight
 
     def _draw(self, model: Model, walkers: int) -> Iterator[_Tries]:
         """Draw the tries of the next steps, and compute their densities at once."""

@@ -98,7 +98,11 @@ class StudentMixture:
         maps, modes = [], []
         if guess is not None:
             lesser = [guess._modes.index(mode) for mode in range(1, max(guess._modes) + 1)]
-            maps, modes = [*guess.maps], [guess._stand_ins(first) for first in lesser]
+            maps = [*guess.maps]
+            # With the columns lₖ of L, the points μ ± lₖ √p have a component's mean and covariance.
+            for component in lesser:
+                steps = np.sqrt(draws.shape[1]) * guess.factors[component].T
+                modes.append(guess.centers[component] + np.concatenate([steps, -steps]))
         draws, log_slope = apply_maps(maps, draws)
         first = draws
         if guess is not None and modes:
@@ -258,15 +262,6 @@ class StudentMixture:
         """The mode of each component, (components,): components with one center are one mode."""
         centers = [tuple(center) for center in self.centers]
         return [list(dict.fromkeys(centers)).index(center) for center in centers]
-
-    def _stand_ins(self, component: int) -> FloatArray:
-        """Return points (points, free) that represent draws of a component.
-
-        With the columns lₖ of L, the points μ ± lₖ √p have the component's mean and covariance.
-        """
-        steps = np.sqrt(self.centers.shape[1]) * self.factors[component].T
-        points: FloatArray = self.centers[component] + np.concatenate([steps, -steps])
-        return points
 
     def _with(self, other: StudentMixture, weight: float) -> StudentMixture:
         """Return the mixture with the first component of another one added, with a weight."""

@@ -112,17 +112,12 @@ class SecantMap:
 
     @cached_property
     def _readout(self) -> tuple[FloatArray, FloatArray]:
-        """The derivative B (readings, linear) and the displacement w₀ (readings,)."""
+        """The derivative's pseudoinverse B⁺ (linear, readings), the displacement w₀ (readings,)."""
         steps = 0.01 * self._scale
         places = np.repeat(self._center[np.newaxis], 1 + len(steps), axis=0)
         places[1 + np.arange(len(steps)), self._rows] += steps
         at, *beside = self._displacement(places)
-        return (np.array(beside) - at).T / steps, at
-
-    @cached_property
-    def _pseudoinverse(self) -> FloatArray:
-        """The pseudoinverse B⁺, (linear, readings)."""
-        return np.linalg.pinv(self._readout[0])
+        return np.linalg.pinv((np.array(beside) - at).T / steps), at
 
     @cached_property
     def _scale(self) -> FloatArray:
@@ -151,9 +146,10 @@ class SecantMap:
         """Return B⁺ (w − w₀) (models, linear) of free parameters, with the linear ones at c."""
         places = free.copy()
         places[:, self._rows] = self._center[self._rows]
-        size = max(1, (1 << 22) // len(self._readout[1]))  # displacements take memory
+        inverse, at = self._readout
+        size = max(1, (1 << 22) // len(at))  # displacements take memory
         parts = [
-            (self._displacement(places[i : i + size]) - self._readout[1]) @ self._pseudoinverse.T
+            (self._displacement(places[i : i + size]) - at) @ inverse.T
             for i in range(0, len(places), size)
         ]
         return np.concatenate(parts)

@@ -187,7 +187,7 @@ def test_readings_of_both_enter(around: CalibrationSetup) -> None:
     replicated = posterior.with_readings({"record": reading})
     places = np.random.default_rng(8).normal(size=(5, len(posterior.names)))
     parts = posterior.log_density(places) + replicated.log_density(places)
-    both = module._together(posterior, replicated).log_density(places)
+    both = posterior.with_readings_of(replicated).log_density(places)
     _, log_prior = posterior.prior.constrain(places)
     np.testing.assert_allclose(both, parts - log_prior, rtol=1e-10)
 

@@ -22,7 +22,6 @@ import numpy as np
 import scipy
 
 from bwbayes.app.config.config import ALONE, Config, parse
-from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
 from bwbayes.errors import InputWarning, path_text
@@ -141,6 +140,12 @@ def _text(
             '# voltage_is = "command"  # if a DAC holds the voltage between samples; it is taken '
             "for measured\n"
         )
+    # No record tells whether the actuator was demagnetized.
+    start = f"# from_rest = false  # {record.beginning}; "
+    start += "the initial state is unknown and will be estimated"
+    if record.starts_at_zero:
+        start = f"# from_rest = true  # {record.beginning}; "
+        start += "say so if the actuator was demagnetized and nothing moved"
     ending = f"[validation.held_out]\nwindow = {_windows(record, held)}"
     ending += f"  # {record.quantities.clock.unit}: held out, used to validate the bands"
     if not held:
@@ -155,7 +160,7 @@ def _text(
 [record]
 {source}
 train = {_windows(record, train)}  # {record.quantities.clock.unit}: fitted
-{fixes["record"]}{_start(record)}
+{fixes["record"]}{record.quantities.say(start)}
 {command}
 [model]
 dynamics = {dynamics}
@@ -221,15 +226,6 @@ def _heading(record: Record) -> str:
     return f"{heading}\n{record.quantities.say(extent)}"
 
 
-def _start(record: Record) -> str:
-    """Say how the drive starts, and what no record tells of it."""
-    if not record.starts_at_zero:
-        unknown = "the initial state is unknown and will be estimated"
-        return record.quantities.say(f"# from_rest = false  # {record.beginning}; {unknown}")
-    advice = "say so if the actuator was demagnetized and nothing moved"
-    return record.quantities.say(f"# from_rest = true  # {record.beginning}; {advice}")
-
-
 def _held_out(record: Record) -> list[slice]:
     """Return the windows of a quarter of the record whose drive is as the rest's, if there are any.
 
@@ -256,7 +252,8 @@ def _difference(record: Record, windows: list[slice]) -> float:
 
     The largest difference of the distribution functions of voltages and rates, or half of the part
     of the voltages' range that is missing. A single step or ramp has to be fitted, so that the rest
-    has to move by half of the range, and the windows have to move by a tenth.
+    has to move by half of the range, and the windows have to move by a tenth, all stretches
+    together.
     """
     held = np.zeros(record.samples, dtype=np.bool_)
     for window in windows:
@@ -270,27 +267,18 @@ def _difference(record: Record, windows: list[slice]) -> float:
     assert record.displacement is not None
     if not inside or np.ptp(record.displacement[readings & held]) == 0:
         return 1.0
-    extent = float(np.ptp(record.voltage[readings]))
-    motion, tested = _motion(record.voltage[readings], held[readings])
-    if motion < extent / 2 or tested < max(extent / 10, 1e-300):
+    voltage, is_tested = record.voltage[readings], held[readings]
+    edges = np.flatnonzero(np.diff(is_tested)) + 1
+    motions = np.array([np.ptp(stretch) for stretch in np.split(voltage, edges)])
+    is_tested = is_tested[np.append(0, edges)]
+    extent, tested = float(np.ptp(voltage)), float(np.sum(motions[is_tested]))
+    if np.sum(motions[~is_tested]) < extent / 2 or tested < max(extent / 10, 1e-300):
         return 1.0
     thinned = slice(None, None, 1 + record.samples // 20_000)
     held = held[thinned]
     drive = record.voltage[thinned], np.abs(rate(record.voltage, record.interval))[thinned]
     differences = [scipy.stats.ks_2samp(x[held], x[~held])[0] for x in drive]
     return float(max(*differences, (1 - np.ptp(other) / np.ptp(fitted)) / 2))
-
-
-def _motion(voltage: FloatArray, held: BoolArray) -> tuple[float, float]:
-    """Return by how much a voltage (readings,) moves within the stretches fitted, and held out, V.
-
-    In all of them, each by its range.
-    """
-    edges = np.flatnonzero(np.diff(held)) + 1
-    motion = [0.0, 0.0]
-    for stretch, out in zip(np.split(voltage, edges), np.split(held, edges), strict=True):
-        motion[int(out[0])] += float(np.ptp(stretch))
-    return motion[0], motion[1]
 
 
 def _windows(record: Record, windows: list[slice]) -> str:

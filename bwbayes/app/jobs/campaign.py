@@ -519,7 +519,7 @@ def resume(
             short={"not converged": 0, "refused": 0},
             workers=workers,
             executor=executor,
-            doing=partial(_doing, folder),
+            doing=folder.first_progress,
         ):
             if status == "refused":
                 refused[file.name] = reason
@@ -567,15 +567,6 @@ def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
         finally:
             with suppress(OSError):
                 console.path.unlink(missing_ok=True)
-
-
-def _doing(campaign: CampaignFolder) -> str:
-    """Say what the first of the records that are being fitted is at, as its run says it."""
-    for path in sorted(campaign.path.glob(campaign.progress("*").name)):
-        with suppress(OSError):
-            if line := path.read_text(encoding="utf-8"):
-                return f"{path.stem[1:]}: {line}"
-    return ""
 
 
 def _begun_run(file: Path, campaign: CampaignFolder) -> Run:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -259,6 +259,15 @@ class CampaignFolder(Folder):
     def progress(self, name: str) -> Path:
         """Return the file that says what a record's run is at, as long as it is fitted."""
         return self.path / f".{name}.progress"
+
+    def first_progress(self) -> str:
+        """Say what the first of the records that are being fitted is at, as its run says it."""
+        for path in sorted(self.path.glob(self.progress("*").name)):
+            with suppress(OSError):
+                line = path.read_text(encoding="utf-8")
+                if line:
+                    return f"{path.stem[1:]}: {line}"
+        return ""
 
     @classmethod
     def create(cls, path: Path, config: str, origin: Origin, *, overwrite: bool) -> Self:

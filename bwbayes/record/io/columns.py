@@ -178,6 +178,20 @@ class Naming:
         named = self.covariates
         return dict(named) if isinstance(named, Mapping) else {name: name for name in named}
 
+    def of_file(self, source: Source, quantity: str) -> Naming:
+        """Return the naming for one of two files; its only column besides times is the quantity."""
+        columns = {q: c for q, c in self.columns.items() if q in ("time", quantity)}
+        if len(source.series) == 1:
+            columns.pop("time", None)
+        others = [s for s in source.series if likeness(s.label, s.unit, "time") is None]
+        if quantity not in columns and len(others) == 1:
+            columns[quantity] = others[0].name
+        units = {q: unit for q, unit in self.units.items() if q in ("time", quantity)}
+        covariates = self.covariates if quantity == "voltage" else ()
+        return replace(
+            self, columns=columns, units=units, covariates=covariates, displacement_file=None
+        )
+
 
 @dataclass(frozen=True)
 class ColumnTable:

@@ -27,7 +27,7 @@ from bwbayes.model.inputs import VoltageIs, require_voltage_is
 from bwbayes.record.instruments import Instruments
 from bwbayes.record.io.columns import ColumnTable, Naming, select
 from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
-from bwbayes.record.io.recognition import QUANTITIES, likeness, rises
+from bwbayes.record.io.recognition import QUANTITIES, rises
 from bwbayes.record.io.series import INSTRUMENT_NOTES, Clock, Source
 
 _MINIMUM_SAMPLES = 10
@@ -362,7 +362,7 @@ def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
     errors: list[ColumnsError] = []
     for quantity in ("displacement", "voltage"):
         source = sources[quantity]
-        own_naming = _own(source, naming, quantity)
+        own_naming = naming.of_file(source, quantity)
         # The file with the voltage must have times, unless the other one has them.
         is_asked = quantity == "voltage" and not any("time" in t.columns for t in tables.values())
         may_have_times = len(source.series) > 1 and any(map(rises, source.series))
@@ -384,21 +384,6 @@ def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
         fs = rates[0] if rates else None
         raise ColumnsError(problem, guess["columns"], guess["units"], fs=fs)
     return _joined(tables["voltage"], tables["displacement"], naming)
-
-
-def _own(source: Source, naming: Naming, quantity: str) -> Naming:
-    """Return the naming for one file; its only column besides times holds the quantity."""
-    columns = {q: c for q, c in naming.columns.items() if q in ("time", quantity)}
-    if len(source.series) == 1:
-        columns.pop("time", None)
-    others = [s for s in source.series if likeness(s.label, s.unit, "time") is None]
-    if quantity not in columns and len(others) == 1:
-        columns[quantity] = others[0].name
-    units = {q: unit for q, unit in naming.units.items() if q in ("time", quantity)}
-    covariates = naming.covariates if quantity == "voltage" else ()
-    return replace(
-        naming, columns=columns, units=units, covariates=covariates, displacement_file=None
-    )
 
 
 def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> ColumnTable:
