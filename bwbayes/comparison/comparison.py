@@ -302,15 +302,14 @@ class Comparison(Product):
         """Return what is recommended, what speaks against it, and the numbers, to be shown."""
         first, *others = self.lines
         tables = [self._models_table(), self._differences_table()]
+        banners = standing_banner(self.standing)
+        banners.append(Banner(kind_of(self.standing) if self.recommended else "bad", first, others))
+        if self.caveats:
+            banners.append(Banner("note", "Caveats", items=self.caveats, label="caveat"))
         return Report(
             title="Comparison of models",
             heading="Which model",
-            banners=[
-                *standing_banner(self.standing),
-                Banner(kind_of(self.standing) if self.recommended else "bad", first, others),
-                *[Banner("note", "Caveats", items=self.caveats, label="caveat")]
-                * bool(self.caveats),
-            ],
+            banners=banners,
             blocks=[
                 *(table for table in tables if table.rows),
                 Section("Models and readings", [Facts(self.facts)]),

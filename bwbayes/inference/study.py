@@ -259,11 +259,11 @@ class Study:
         say, statements = self.quantities.say, {**self.stated, **(added or {})}
         values = _values_of(statements)
         units = {d.name: say(d.unit_in(values)) for d in declarations_of(spec, self.extent)}
-        stated = {
-            name: statement
-            for name, statement in statements.items()
-            if (plain := name.partition("[")[0]) in units and statement.unit in (None, units[plain])
-        }
+        stated = {}
+        for name, statement in statements.items():
+            plain, _, _ = name.partition("[")
+            if plain in units and statement.unit in (None, units[plain]):
+                stated[name] = statement
         per_record, shared = (
             tuple(name for name in names if name in units)
             for names in (self.per_record, self.shared)

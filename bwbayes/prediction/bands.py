@@ -320,11 +320,11 @@ class Bands:
         inside = np.zeros(self.time.size, dtype=np.bool_)
         for window in windows:
             inside[window] = True
-        changes: dict[str, Any] = {
-            name: np.where(inside, values, np.nan)[span]
-            for name in ("measured", "truth", "pit", "crps", "log_score")
-            if (values := getattr(self, name)) is not None
-        }
+        changes = dict[str, Any]()
+        for name in ("measured", "truth", "pit", "crps", "log_score"):
+            values = getattr(self, name)
+            if values is not None:
+                changes[name] = np.where(inside, values, np.nan)[span]
         for name in ("time", "voltage", "mean"):
             changes[name] = getattr(self, name)[span]
         for name in ("lower", "upper"):

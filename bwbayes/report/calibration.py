@@ -11,6 +11,7 @@ from bwbayes.calibration.calibration import FAMILY_LEVEL, JUDGED_FROM, RANKED, C
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.report import (
     Banner,
+    Block,
     Facts,
     Kind,
     Picture,
@@ -49,9 +50,14 @@ def calibration_report(calibration: Calibration) -> Report:
         "good": f"{counts}; nothing speaks against the posteriors",
         "note": f"{counts}; low power: more replicates are needed to detect SDs 20% too small",
     }
-    verdict = Banner(kind, headline, [lines[kind]], calibration.failures)
-    numbers = ", ".join(map(str, unconverged))
-    line = f"not converged, and counted with the others: replicates {numbers}"
+    banners = [Banner(kind, headline, [lines[kind]], calibration.failures)]
+    if unconverged:
+        numbers = ", ".join(map(str, unconverged))
+        line = f"not converged, and counted with the others: replicates {numbers}"
+        banners.append(Banner("note", "Replicates that did not converge", [line]))
+    blocks: list[Block] = [_statistics(calibration)]
+    if bands.rows:
+        blocks.append(Section("Bands on samples that were not fitted", [bands], folded=False))
     facts = [*calibration.facts, *circumstances(calibration.provenance)]
     free = [
         {"name": p.name, "symbol": symbol(p), "prior": p.prior, "unit": unit_text(p.unit)}
@@ -64,14 +70,9 @@ def calibration_report(calibration: Calibration) -> Report:
         quantities=calibration.quantities,
         title=f"{calibration.name}, simulation-based calibration",
         heading=f"Simulation-based calibration: {calibration.name}",
-        banners=[
-            verdict,
-            *[Banner("note", "Replicates that did not converge", [line])] * bool(unconverged),
-        ],
+        banners=banners,
         blocks=[
-            _statistics(calibration),
-            *[Section("Bands on samples that were not fitted", [bands], folded=False)]
-            * bool(bands.rows),
+            *blocks,
             Section("Pictures", _pictures(calibration), folded=False),
             Section("Tests", _tests(calibration), folded=False),
             Section("Priors", [Table.of("priors", "Priors", free, columns)]),

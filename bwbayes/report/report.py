@@ -275,7 +275,9 @@ def kind_of(standing: ValidationSummary, *, good: bool = True) -> Kind:
 
 def remarks_banner(remarks: Sequence[str], headline: str = "Remarks") -> list[Banner]:
     """Return a banner with the remarks for the user, if there are any."""
-    return [Banner("note", headline, items=remarks, label="note", name="remarks")] * bool(remarks)
+    if not remarks:
+        return []
+    return [Banner("note", headline, items=remarks, label="note", name="remarks")]
 
 
 def standing_banner(standing: ValidationSummary, on: Target = "both") -> list[Banner]:
@@ -538,9 +540,11 @@ def circumstances(numbers: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the facts of the run in the summary besides its results."""
     if "seed" in numbers:
         yield "seed", str(numbers["seed"])
-    if isinstance(wall := numbers.get("wall_s"), int | float):
+    wall = numbers.get("wall_s")
+    if isinstance(wall, int | float):
         yield "wall time", f"{wall:.0f} s"
     if "data_sha256" in numbers:
         yield "data, SHA-256", str(numbers["data_sha256"])
-    if isinstance(versions := numbers.get("versions"), Mapping):
+    versions = numbers.get("versions")
+    if isinstance(versions, Mapping):
         yield "versions", ", ".join(f"{name} {version}" for name, version in versions.items())

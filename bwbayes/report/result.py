@@ -315,7 +315,9 @@ def write_bands(
     with draft_of(path) as draft, draft.open("w", encoding="utf-8") as file:
         tables = [dict(predicted.columns()) for predicted in bands]
         names = [*dict.fromkeys(name for table in tables for name in table)]
-        headings = [*["set"] * (len(bands) > 1), *map(quantities.heading, names)]
+        headings = [*map(quantities.heading, names)]
+        if len(bands) > 1:
+            headings.insert(0, "set")
         file.write(",".join(headings) + "\n")
         for predicted, table in zip(bands, tables, strict=True):
             missing = np.full(table["time_s"].size, np.nan)
@@ -371,13 +373,15 @@ def save(
         if drawn:
             save_pictures(drawn, folder / pictures)
         page.write_text(render(report, drawn), encoding="utf-8")
-        report = report.said()
+        report, files = report.said(), [page]
         if report.csv:
+            files.insert(0, table)
             with draft_of(table) as draft:
                 draft.write_text(report.csv, encoding="utf-8", newline="")
         if report.numbers:
+            files.insert(0, numbers)
             write_summary(numbers, report.numbers)
-    return [*[numbers] * bool(report.numbers), *[table] * bool(report.csv), page]
+    return files
 
 
 def refuse_existing(files: Sequence[Path], *, overwrite: bool) -> None:

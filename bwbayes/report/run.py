@@ -90,7 +90,8 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     held_out = [
         f"{bands.name} ({_span(bands)})" for bands in result.predictions if not bands.training
     ]
-    about += [f"predicted: {', '.join(held_out)}"] * bool(held_out)
+    if held_out:
+        about.append(f"predicted: {', '.join(held_out)}")
     return Report(
         title=result.name,
         about="; ".join(about),
@@ -487,8 +488,9 @@ def rivals_table(predictions: Iterable[Bands]) -> list[Table]:
         "These drives are unlike the training record's: there the sensor band has in it how much "
         "other models of the training record differ."
     )
-    table = Table("rivals", "Bands with and without rivals", columns, rows, note=note, on="both")
-    return [table] * bool(rows)
+    if not rows:
+        return []
+    return [Table("rivals", "Bands with and without rivals", columns, rows, note=note, on="both")]
 
 
 def correction_texts(predictions: Iterable[Bands]) -> list[Text]:

@@ -173,9 +173,10 @@ class StudentMixture:
         if "weights" not in arrays:
             return None
         maps: list[Map] = []
-        for name, kind in _MAPS.items():
-            keys = {field.name: f"{name}_{field.name}" for field in fields(kind)}
-            if stored := {key: arrays[stored] for key, stored in keys.items() if stored in arrays}:
+        for map_name, kind in _MAPS.items():
+            keys = {field.name: f"{map_name}_{field.name}" for field in fields(kind)}
+            stored = {key: arrays[name] for key, name in keys.items() if name in arrays}
+            if stored:
                 maps.append(kind(**stored))
         parts = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
         return cls(**parts, maps=tuple(maps))

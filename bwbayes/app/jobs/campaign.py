@@ -310,21 +310,20 @@ class Campaign(Product):
         if self._spreads:
             population = self._population_table()
         name = self.folder.path.name
+        banners = [Banner(worst, f"{len(self.rows)} records", [counts])]
+        if outliers:
+            headline = "Off the population, and without weight in it"
+            banners.append(Banner("note", headline, items=outliers))
+        blocks = [population]
+        if attention:
+            blocks.insert(0, Table("short", "Records to look at", columns, attention, on="both"))
+        if self._units:
+            blocks.append(picture)
         return Report(
             title=f"{name}, campaign",
             heading=f"Campaign: {name}",
-            banners=[
-                Banner(worst, f"{len(self.rows)} records", [counts]),
-                *[Banner("note", "Off the population, and without weight in it", items=outliers)]
-                * bool(outliers),
-            ],
-            blocks=[
-                *[Table("short", "Records to look at", columns, attention, on="both")]
-                * bool(attention),
-                population,
-                *[picture] * bool(self._units),
-                Section("Records", [self._records_table()]),
-            ],
+            banners=banners,
+            blocks=[*blocks, Section("Records", [self._records_table()])],
             numbers=self._numbers(),
             csv=self.table.to_csv(float_format="%.7g", lineterminator="\n"),
         )

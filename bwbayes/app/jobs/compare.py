@@ -188,7 +188,8 @@ def _require_same(pair: str, first: Study, other: Study) -> None:
         )
     if windows[0] != windows[1]:
         raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
-    if different := ", ".join(sorted({name for name, *_ in held_out[0] ^ held_out[1]})):
+    different = ", ".join(sorted({name for name, *_ in held_out[0] ^ held_out[1]}))
+    if different:
         raise InputError(
             f"{pair}: differ in what is held out ({different}); give both the same [validation]"
         )

@@ -190,7 +190,8 @@ def run_remarks(run: Run, watch: Watch = unwatched) -> list[str]:
     for name, explanations in run.explanations.items():
         remarks += [of[name] + line for line in lines(likely_causes(explanations))]
     for bands in run.predictions:
-        remarks += [f"{bands.name}: {bands.model_error_note}"] * bool(bands.model_error_note)
+        if bands.model_error_note:
+            remarks.append(f"{bands.name}: {bands.model_error_note}")
     for name, verdict in run.validation.items():
         remarks += [f"{name}: {note}" for note in verdict.notes]
     return remarks

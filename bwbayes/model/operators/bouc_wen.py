@@ -297,7 +297,7 @@ class BoucWen(OneState):
                 loop=True,
                 aliases=("n",),
             ),
-            initial(lambda earlier: (-(top := _top(earlier)), top)),
+            initial(lambda earlier: (-_top(earlier), _top(earlier))),
         )
 
     def check(self, column: Values) -> None:

@@ -186,8 +186,12 @@ class BacklashLike(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, α, β and the initial h."""
-        start = initial(lambda e: (-(top := ceiling(e["alpha"], e["beta"])), top))
-        return d(), alpha(), beta(), start
+
+        def bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+            top = ceiling(earlier["alpha"], earlier["beta"])
+            return -top, top
+
+        return d(), alpha(), beta(), initial(bounds)
 
     def step(self, column: Values) -> HysteresisStep:
         """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""

@@ -122,10 +122,11 @@ class Naming:
             "displacement": self.instruments.sensor_scale,
             "voltage": self.instruments.amplifier_gain,
         }
-        return {
-            quantity: f"{unit} +- {100 * sd:.6g} %" if (sd := uncertain.get(quantity)) else unit
-            for quantity, unit in self.units.items()
-        }
+        units = dict(self.units)
+        for quantity, sd in uncertain.items():
+            if sd and quantity in units:
+                units[quantity] += f" +- {100 * sd:.6g} %"
+        return units
 
     def _require_units(self) -> None:
         """Refuse a unit that its quantity cannot have."""

@@ -425,12 +425,11 @@ def with_units(
     The time stands before the channels, if there is one column more than units. A name that stands
     twice gets a number behind its unit; the unit without that number is returned.
     """
-    units = [
-        unit or next((u for q in QUANTITIES if (u := unit_in(name, q))), "")
-        if names.count(name) > 1
-        else unit
-        for name, unit in zip(names, units, strict=True)
-    ]
+    units = [*units]
+    for column, name in enumerate(names):
+        if names.count(name) > 1 and not units[column]:
+            possible = (unit_in(name, quantity) for quantity in QUANTITIES)
+            units[column] = next(filter(None, possible), "")
     channels = [unit for unit in preamble.get("vertical_units", []) if unit]
     time = preamble.get("horizontal_units", [""])[:1]
     stated = [*(time if len(channels) == len(units) - 1 else []), *channels]

@@ -106,10 +106,10 @@ def segments(bands: Bands) -> list[Bands]:
 
 def choose(bands: Bands, rows: IntArray) -> Bands:
     """Return the bands at some of their samples."""
-    changes: dict[str, Any] = {
-        name: None if (values := getattr(bands, name)) is None else values[rows]
-        for name in ("time", "voltage", "measured", "truth", "mean")
-    }
+    changes = dict[str, Any]()
+    for name in ("time", "voltage", "measured", "truth", "mean"):
+        values = getattr(bands, name)
+        changes[name] = None if values is None else values[rows]
     for side in ("lower", "upper"):
         changes[side] = {band: edge[rows] for band, edge in getattr(bands, side).items()}
     return replace(bands, **changes, inside=None)
