@@ -57,75 +57,75 @@ class Defect:
     finding: str = ""
     in_bands: tuple[str, str] = ("", "")
 
-    def explanations(self, scene: ResidualAnalysis) -> Iterator[Explanation]:
+    def explanations(self, analysis: ResidualAnalysis) -> Iterator[Explanation]:
         """Fit the model with the stage to a record that does not have it yet."""
-        stage, inputs = STAGES[self.stage](), scene.posterior.single_record.inputs
-        if self.stage in scene.study.spec.chain or not all(map(inputs.has, stage.sees)):
+        stage, inputs = STAGES[self.stage](), analysis.posterior.single_record.inputs
+        if self.stage in analysis.study.spec.chain or not all(map(inputs.has, stage.sees)):
             return
         if not (stage.rate_independent or inputs.quantities.has_clock):
             return
         flags = {"foreign": self.foreign, "removes": self.removes, "noise": self.noise}
-        words = partial(self.words, scene)
-        for sighting in self.sightings(scene):
-            for explanation in scene.changed(self.kind, words, (self.stage,), sighting, flags):
+        words = partial(self.words, analysis)
+        for sighting in self.sightings(analysis):
+            for explanation in analysis.changed(self.kind, words, (self.stage,), sighting, flags):
                 named_only = stage.named_only or sighting.named_only
                 yield replace(explanation, spec=None) if named_only else explanation
 
-    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:  # noqa: ARG002
+    def sightings(self, analysis: ResidualAnalysis) -> Iterator[Sighting]:  # noqa: ARG002
         """Yield the starting points for a fit of the stage."""
         yield Sighting(starts=STAGES[self.stage]().starts)
 
-    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:  # noqa: ARG002
+    def words(self, analysis: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:  # noqa: ARG002
         """Return the text and the fix for the parameters' values by name."""
         stage = STAGES[self.stage]()
         return stage.describe(values), stage.advice
 
 
 class _Transient(Defect):
-    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
+    def words(self, analysis: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
         """Leave the start out, until a five-hundredth of the range is left of the transient."""
-        threshold = 0.002 * scene.extent
+        threshold = 0.002 * analysis.extent
         until = values["transient_time"] * np.log(max(abs(values["transient"]) / threshold, 1.0))
-        window = f"set exclude = [[{scene.clock(0.0)}, {scene.clock(until)}]] in [record]"
-        settled = int(np.searchsorted(scene.time[: scene.voltage.size], until))
-        return super().words(scene, values)[0], settle_fix(scene.voltage, settled, window)
+        window = f"set exclude = [[{analysis.clock(0.0)}, {analysis.clock(until)}]] in [record]"
+        settled = int(np.searchsorted(analysis.time[: analysis.voltage.size], until))
+        return super().words(analysis, values)[0], settle_fix(analysis.voltage, settled, window)
 
 
 class _Step(Defect):
-    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+    def sightings(self, analysis: ResidualAnalysis) -> Iterator[Sighting]:
         """Yield the time of the largest innovation; its choice among the readings has a cost.
 
         If readings just before it were not fitted, the largest innovation among these gives the
         time.
         """
-        rows = scene.posterior.single_record.readings.rows
-        white = np.abs(scene.innovations)
+        rows = analysis.posterior.single_record.readings.rows
+        white = np.abs(analysis.innovations)
         white[: max(white.size // 50, 1)] = 0.0
         number = int(np.argmax(white))
-        between = scene.posterior.altered(training=(slice(rows[number - 1], rows[number] + 1),))
-        white_between = np.abs(innovations(between, scene.fit.free).white)[1:]
+        between = analysis.posterior.altered(training=(slice(rows[number - 1], rows[number] + 1),))
+        white_between = np.abs(innovations(between, analysis.fit.free).white)[1:]
         row = between.single_record.readings.rows[1 + int(np.argmax(white_between))]
-        stated = {"step_time": Stated(fixed=scene.interval * row)}
+        stated = {"step_time": Stated(fixed=analysis.interval * row)}
         yield Sighting(stated, cost=float(np.log(rows.size)))
 
-    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
+    def words(self, analysis: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
         """Name its time on the record's clock."""
-        time = scene.begin + values["step_time"]
-        text, _ = super().words(scene, {**values, "step_time": time})
-        written = clock(time, scene.interval)
+        time = analysis.begin + values["step_time"]
+        text, _ = super().words(analysis, {**values, "step_time": time})
+        written = clock(time, analysis.interval)
         return text, f"fit one side: set train to end or begin at {written}"
 
 
 class _Oscillation(Defect):
-    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+    def sightings(self, analysis: ResidualAnalysis) -> Iterator[Sighting]:
         """Yield the innovations' strongest frequency that the drive lacks, to its resolution.
 
         An oscillation that grows with the drive may be the actuator's own: it is only named.
         """
-        rows = scene.posterior.single_record.readings.rows
-        line = strongest_line(scene.innovations, scene.voltage[rows], rows, scene.interval)
+        rows = analysis.posterior.single_record.readings.rows
+        line = strongest_line(analysis.innovations, analysis.voltage[rows], rows, analysis.interval)
         if line is not None:
-            resolution = normal(line.frequency, 1 / (np.sqrt(12) * scene.duration))
+            resolution = normal(line.frequency, 1 / (np.sqrt(12) * analysis.duration))
             yield Sighting(
                 {"oscillation_frequency": Stated(resolution)},
                 cost=float(np.log(rows.size / 2)),
@@ -135,51 +135,54 @@ class _Oscillation(Defect):
 
 
 class _Sign(Defect):
-    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+    def sightings(self, analysis: ResidualAnalysis) -> Iterator[Sighting]:
         """Yield the fit of the readings with their sign changed, if they fall with the voltage.
 
         A delay that the model has counts: of a sine, half a period is another sign.
         """
-        record = scene.posterior.single_record
-        theta = scene.posterior.prior.theta(scene.fit.free[np.newaxis])[0].tolist()
-        values = dict(zip(scene.posterior.table.names, theta, strict=True))
+        record = analysis.posterior.single_record
+        theta = analysis.posterior.prior.theta(analysis.fit.free[np.newaxis])[0].tolist()
+        values = dict(zip(analysis.posterior.table.names, theta, strict=True))
         readings, samples = record.readings, np.arange(record.voltage.size)
-        late = values.get("delay", 0.0) / scene.interval
+        late = values.get("delay", 0.0) / analysis.interval
         drive = np.interp(readings.rows - late, samples, record.voltage)
         if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) < 0:
-            turned = scene.posterior.altered(displacement=-record.displacement)
-            yield Sighting(places=scene.local_minima(turned))
+            turned = analysis.posterior.altered(displacement=-record.displacement)
+            yield Sighting(places=analysis.local_minima(turned))
 
 
 class _Delay(Defect):
-    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
+    def words(self, analysis: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
         """Return the text, and the column to move as the fix."""
-        fix = late_fix(values["delay"], scene.interval / scene.stride)
-        return super().words(scene, values)[0], fix
+        fix = late_fix(values["delay"], analysis.interval / analysis.stride)
+        return super().words(analysis, values)[0], fix
 
 
 class _LongDelay(_Delay):
-    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+    def sightings(self, analysis: ResidualAnalysis) -> Iterator[Sighting]:
         """Yield a delay up to a quarter of a period, estimated by a fit of loops.
 
         The fits start from the modes for readings that are moved back by it.
         """
-        record = scene.posterior.single_record
-        prior = Delay.parameters[0].default(scene.study.contexts[""])
+        record = analysis.posterior.single_record
+        prior = Delay.parameters[0].default(analysis.study.contexts[""])
         assert isinstance(prior, Distribution)
         sd = prior.arguments["sd"]
         limit = FARTHEST_FOLLOWED * sd
         kept = np.full(record.displacement.size, np.nan)
         for window in record.training:
             kept[window] = record.displacement[window]
-        late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), limit)
-        rows = round(late / scene.interval)
-        if abs(late) < max(scene.turn_time / 50, scene.interval / scene.stride) or not rows:
+        late, _ = find_delay(Record(record.voltage, kept, interval=analysis.interval), limit)
+        rows = round(late / analysis.interval)
+        if (
+            abs(late) < max(analysis.turn_time / 50, analysis.interval / analysis.stride)
+            or not rows
+        ):
             return
         kept[: max(rows, 0)] = kept[kept.size + min(rows, 0) :] = np.nan
         windows = (slice(0, kept.size),)
-        moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=windows)
-        places = scene.local_minima(moved)
+        moved = analysis.posterior.altered(displacement=np.roll(kept, -rows), training=windows)
+        places = analysis.local_minima(moved)
         yield Sighting(starts=[{"delay": late / sd}], places=places)
 
 
