@@ -19,7 +19,7 @@ from bwbayes.model.linear import Creep, creep_times
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator
 from bwbayes.model.registry import HYSTERESIS, OPTIONS, PARTS, STAGES, build_part
-from bwbayes.model.stage import Side, Stage
+from bwbayes.model.stage import Stage
 
 Slot = Literal["input", "hysteresis", "nonlinearity", "dynamics", "creep", "output"]
 """Where a stage stands; the slots are in the order of the signal's way."""
@@ -124,7 +124,7 @@ class ModelSpec:
             ),
             StageSpec("dynamics", keys["dynamics"]),
             *(StageSpec("nonlinearity", term) for term in keys["nonlinearity"]),
-            *(StageSpec(_side_of(name), name) for name in keys["stages"]),
+            *(StageSpec(_stage_named(name).side, name) for name in keys["stages"]),
         ]
         if keys["creep"]:
             stages.append(_creep(keys["creep"], keys["creep_growth"]))
@@ -202,6 +202,17 @@ class ModelSpec:
             self, stages=tuple(stage for stage in self.stages if stage.name not in names)
         )
 
+    @property
+    def without_clock(self) -> Self:
+        """The model of records that have no time: its rate-independent stages and white noise."""
+        timed = [
+            stage.name
+            for stage in self.stages
+            if stage.slot in ("dynamics", "creep")
+            or (stage.slot in ("input", "output") and not _stage_named(stage.name).rate_independent)
+        ]
+        return replace(self.without(*timed), noise="white")
+
     def explicit(self, actuator: Actuator) -> Self:
         """Return the spec with all that it left open as an actuator of it has it, but the hold.
 
@@ -239,7 +250,7 @@ class ModelSpec:
             PolynomialNonlinearity(terms, extent.span) if terms else None,
             Creep(tuple(times), keys["creep_growth"], extent.span) if times else None,
             extent.span,
-            tuple(build_part("model.stages", name, STAGES, {}, Stage) for name in keys["stages"]),
+            tuple(map(_stage_named, keys["stages"])),
             self.history == "demagnetized",
         )
 
@@ -264,8 +275,9 @@ def _creep(times: Any, growth: bool) -> StageSpec:
 
 def _slot_of(name: str) -> Slot:
     slots = (slot for slot in get_args(Slot) if name in PARTS.get(slot, ()))
-    return next(slots, None) or _side_of(name)
+    return next(slots, None) or _stage_named(name).side
 
 
-def _side_of(name: str) -> Side:
-    return build_part("model.stages", name, STAGES, {}, Stage).side
+def _stage_named(name: str) -> Stage:
+    """Return a stage before or behind the hysteresis, by its name or import path."""
+    return build_part("model.stages", name, STAGES, {}, Stage)

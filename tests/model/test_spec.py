@@ -8,9 +8,10 @@ from hypothesis import given, strategies as st
 from bwbayes.app.config.config import ModelConfig
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES
+from bwbayes.model.inputs import Span
 from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
-from bwbayes.model.spec import ModelSpec, StageSpec
+from bwbayes.model.spec import Extent, ModelSpec, StageSpec
 
 FURTHER = (*TERMS, *STAGES, "creep")
 
@@ -66,3 +67,18 @@ def test_a_stage_is_added_replaced_and_left_out(spec: ModelSpec, name: str) -> N
     assert [stage for stage in added.chain if stage in STAGES] == [
         stage for stage in STAGES if stage in added.chain
     ]
+
+
+@given(specs())
+def test_without_a_clock_only_the_path_of_the_voltage_counts(spec: ModelSpec) -> None:
+    """Every other stage stays, and the noise is white; a config keeps what both have in common."""
+    timeless = spec.without_clock
+    actuator = timeless.actuator(1.0, "first", Extent(Span(-1.0, 1.0), 1.0, 100.0))
+    assert actuator.static.stages == actuator.stages
+    assert (actuator.dynamics, actuator.creep, timeless.noise) == ("none", None, "white")
+    lost = [name for name in spec.chain if name not in timeless.chain]
+    assert all(
+        name in DYNAMICS or name == "creep" or not STAGES[name]().rate_independent for name in lost
+    )
+    assert timeless.without_clock == timeless
+    assert ModelConfig.model_validate(spec.keys).with_spec(timeless).spec == timeless

@@ -28,7 +28,6 @@ import numpy as np
 from bwbayes.app.config.config import (
     ALONE,
     Config,
-    ModelConfig,
     ParameterConfig,
     RecordConfig,
     SignalConfig,
@@ -51,7 +50,6 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Distribution
 from bwbayes.model.inputs import VoltageIs
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.registry import STAGES
 from bwbayes.quantities import Quantities
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
@@ -239,15 +237,6 @@ def require_alike(records: Mapping[str, Record]) -> None:
                 f"{place_of(name)}: states other uncertainties of its units than the first record; "
                 "records are fitted together by the same instruments: state the same of all"
             )
-
-
-def without_clock(model: ModelConfig) -> ModelConfig:
-    """Return a model without what needs a clock, of records that have none."""
-    stages = model.stages
-    if stages != "auto":
-        stages = [name for name in stages if name in STAGES and STAGES[name]().rate_independent]
-    changes = {"dynamics": "none", "creep": False, "creep_growth": False, "noise": "white"}
-    return model.model_copy(update={**changes, "stages": stages})
 
 
 def _require_usable(record: Record, where: str) -> None:

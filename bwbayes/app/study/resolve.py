@@ -24,7 +24,6 @@ from bwbayes.app.study.from_config import (
     training_records,
     validations_of,
     windows_of,
-    without_clock,
 )
 from bwbayes.arrays import IntArray
 from bwbayes.diagnosis.record_checks import isolated_outliers
@@ -117,8 +116,8 @@ def _resolved(config: Config, study: Study, stand: VirtualTestStand | None) -> R
     """Make a run of a config whose records are read."""
     remarks = []
     if not study.quantities.has_clock:
-        config = config.model_copy(update={"model": without_clock(config.model)})
-        study = replace(study, spec=config.model.spec)
+        study = replace(study, spec=study.spec.without_clock)
+        config = config.model_copy(update={"model": config.model.with_spec(study.spec)})
         remarks.append(
             "the record has no time, so it is taken as rate independent: dynamics, creep, stages "
             "that need a clock and the model error's correlation time are left out"
