@@ -14,7 +14,7 @@ until it does not change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import scipy
@@ -24,6 +24,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.likelihood import Readings
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study
 from bwbayes.model.inputs import rate
 
 # Standard deviations from what its neighbors predict at which a reading is an outlier.
@@ -34,43 +35,42 @@ MOST = 0.05
 
 
 def outliers(
-    without: Callable[[Mapping[str, IntArray]], Posterior],
-    generator: np.random.Generator,
-    suspects: Mapping[str, IntArray] | None = None,
+    study: Study, generator: np.random.Generator, suspects: Mapping[str, IntArray]
 ) -> dict[str, IntArray]:
-    """Return the samples (outliers,) of each record, by name, whose readings are to be set aside.
+    """Return the samples (outliers,) of records, by name, whose readings are to be set aside.
 
     Parameters
     ----------
-    without
-        Returns the posterior, with the priors that its readings lead to, without the readings of
-        some samples of each record, by name.
+    study
+        The study of all readings; its priors are those that the others lead to.
     generator
         Random generator of the fits.
     suspects
-        Samples (suspects,) of each record, by name, that the first fit leaves out. Whether they are
-        outliers is decided afterwards.
+        Samples (suspects,) of each record that is searched, by name, that the first fit leaves out.
+        Whether they are outliers is decided afterwards.
 
     Raises
     ------
     InputError
         More than one in twenty of a record's readings would be.
     """
-    datasets = without({}).datasets
-    if any(dataset.noise.tailed for dataset in datasets):
+    datasets = {dataset.name: dataset for dataset in study.posterior.datasets}
+    if any(dataset.noise.tailed for dataset in datasets.values()):
         raise InputError("model.outliers: noise has heavy tails, which are for outliers; remove it")
-    readings_of = {dataset.name: dataset.readings for dataset in datasets}
+    readings_of = {name: datasets[name].readings for name in suspects}
     aside: dict[str, BoolArray] = {
-        name: np.isin(readings.rows, (suspects or {}).get(name, []))
-        for name, readings in readings_of.items()
+        name: np.isin(readings.rows, suspects[name]) for name, readings in readings_of.items()
     }
     cleared = {name: np.zeros_like(mask) for name, mask in aside.items()}
     for _ in range(10):
-        posterior = without({name: readings_of[name].rows[mask] for name, mask in aside.items()})
+        rows = {name: readings_of[name].rows[mask] for name, mask in aside.items()}
+        posterior = study.without(rows).posterior
         point = pointfit.fit(posterior, generator.spawn(1)[0])
         before = dict(aside)
         free = posterior.prior.constrain(point.mode[np.newaxis])[0]
         for name, alone, values in posterior.each(free):
+            if name not in suspects:
+                continue
             position, mask = alone.prior.unconstrain(values)[0], aside[name]
             away = np.abs(surprise(alone, position, readings_of[name]))
             # Spikes in a fit make its noise larger than that of most readings: theirs counts, but

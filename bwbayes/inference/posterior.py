@@ -246,13 +246,6 @@ class Posterior:
         """Return the posterior of its own readings and of another's, with the same parameters."""
         return replace(self, datasets=self.datasets + other.datasets, joint=self.table)
 
-    def without(self, rows: Mapping[str, IntArray]) -> Posterior:
-        """Return the posterior without the readings of some samples of its records, by name."""
-        displacements = {dataset.name: dataset.displacement.copy() for dataset in self.datasets}
-        for name, left_out in rows.items():
-            displacements[name][left_out] = np.nan
-        return self.with_readings(displacements)
-
     @cached_property
     def _by_record(self) -> dict[str, Posterior]:
         """The posterior of each record alone."""

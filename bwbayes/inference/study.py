@@ -19,7 +19,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference import Engine
 from bwbayes.inference.defaults import join_ranges, ranges_of
@@ -286,6 +286,14 @@ class Study:
         )
         vars(alone)["ranges"] = {record: self.ranges[record]}
         return alone
+
+    def without(self, rows: Mapping[str, IntArray]) -> Self:
+        """Return the study without the readings of some samples of its records, by name.
+
+        Default priors are those that the other readings lead to.
+        """
+        records = {name: self.records[name].without(left_out) for name, left_out in rows.items()}
+        return replace(self, records={**self.records, **records})
 
     @property
     def explicit(self) -> Self:

@@ -10,9 +10,11 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameters import JointPrior, Parameter, ParameterTable
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
 from bwbayes.model.inputs import Hold, Inputs
+from bwbayes.model.spec import ModelSpec, StageSpec
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import TABLE_1
 from tests.declared import NAMES, context, declared, joint, parameter
@@ -114,6 +116,16 @@ def short_posterior(
     return posterior_of(
         voltage, displacement, actuator, noise, fixed, training=training, priors=priors
     )
+
+
+def study_of(*datasets: Likelihood, noise: str = "discrepancy") -> Study:
+    """Return the study of such records with default priors, of an actuator without dynamics."""
+    spec = ModelSpec((StageSpec("hysteresis", "bouc-wen"),), "first", noise=noise)
+    records = {
+        one.name: Record(one.voltage, one.displacement, interval=one.inputs.interval)
+        for one in datasets
+    }
+    return Study(spec, records, {one.name: one.training for one in datasets})
 
 
 def posterior_of_record(record: Record, fixed: Mapping[str, float]) -> Posterior:

@@ -23,7 +23,14 @@ from bwbayes.inference.outliers import outliers
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
-from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender, truth
+from tests.inference.problems import (
+    INTERVAL,
+    decaying_sine,
+    posterior_of,
+    ring_bender,
+    study_of,
+    truth,
+)
 
 ENGINES: list[Engine] = ["numpy", "numba"] if importlib.util.find_spec("numba") else ["numpy"]
 RUNS = [heavy_tails.run]
@@ -271,9 +278,9 @@ def test_outliers_hardly_move_the_estimate(share: float) -> None:
 def test_two_tails_and_outliers_set_aside_are_refused() -> None:
     with pytest.raises(InputError, match=r"two terms with heavy tails or noise .*, but one sensor"):
         noise_model("student + discrepancy + student", 1.0)
-    posterior = moving("discrepancy + student", "numpy")
+    study = study_of(moving("discrepancy", "numpy").single_record, noise="discrepancy + student")
     with pytest.raises(InputError, match=r"model\.outliers: noise has heavy tails"):
-        outliers(lambda _: posterior, np.random.default_rng(1))
+        outliers(study, np.random.default_rng(1), {})
 
 
 def test_a_sum_names_the_tail_wherever_the_term_is() -> None:

@@ -20,6 +20,7 @@ from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise, noise_model
 from bwbayes.inference.outliers import outliers, surprise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Hold, Inputs
 from tests.inference.problems import (
@@ -29,6 +30,7 @@ from tests.inference.problems import (
     ring_bender,
     short_posterior,
     single,
+    study_of,
 )
 
 RINGING = {"mass": 0.00134, "stiffness": 4.1e5}
@@ -259,43 +261,49 @@ def test_parameters_must_be_those_of_the_model() -> None:
 # Isolated outliers are found, all of them and nothing else, and what is left is as without them
 
 
-def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
-    displacement = posterior.single_record.displacement.copy()
+def spoilt(samples: int, rows: list[int], size: float = 20.0) -> Study:
+    """Return the study of a record, some of whose readings are off by a size, um."""
+    record = short_posterior(samples=samples).single_record
+    displacement = record.displacement.copy()
     displacement[rows] += size * (-1.0) ** np.arange(len(rows))
-    return posterior.altered(displacement=displacement)
+    return study_of(replace(record, displacement=displacement))
+
+
+NONE = {"record": np.zeros(0, dtype=np.int64)}
 
 
 def test_a_reading_is_set_aside_from_six_sds_on() -> None:
     """One that is moved to nine sds from what the others predict is, one at four is not."""
-    good = short_posterior(samples=400)
+    good = spoilt(400, []).posterior
     place = pointfit.fit(good, np.random.default_rng(9)).mode
-    before, after = (surprise(p, place)[300] for p in (good, spoilt(good, [300], 1.0)))
+    reading = good.single_record.displacement.copy()
+    reading[300] += 1.0
+    moved_by_one = good.altered(displacement=reading)
+    before, after = (surprise(p, place)[300] for p in (good, moved_by_one))
     for sds, aside in ((9.0, [300]), (4.0, [])):
-        moved = spoilt(good, [300], (sds - before) / (after - before))
-        assert aside == outliers(moved.without, np.random.default_rng(9))["record"].tolist()
+        moved = spoilt(400, [300], (sds - before) / (after - before))
+        assert aside == outliers(moved, np.random.default_rng(9), NONE)["record"].tolist()
 
 
 def test_what_is_left_is_the_posterior_without_those_readings() -> None:
     """The same posterior as that of the good record with these readings missing, exactly."""
-    good = short_posterior(samples=600)
     rows = [40, 41, 300, 599]
-    spiky = spoilt(good, rows)
-    aside = outliers(spiky.without, np.random.default_rng(4))["record"]
-    assert rows == aside.tolist()
-    cleaned, missing = (p.single_record.displacement.copy() for p in (spiky, good))
-    cleaned[aside] = missing[rows] = np.nan
-    z = good.prior.unconstrain(good.prior.draw(np.random.default_rng(5), 5))
-    np.testing.assert_array_equal(
-        spiky.altered(displacement=cleaned).log_density(z),
-        good.altered(displacement=missing).log_density(z),
-    )
+    good, spiky = spoilt(600, []), spoilt(600, rows)
+    aside = outliers(spiky, np.random.default_rng(4), NONE)
+    assert rows == aside["record"].tolist()
+    cleaned, missing = spiky.without(aside).posterior, good.without(aside).posterior
+    z = missing.prior.unconstrain(missing.prior.draw(np.random.default_rng(5), 5))
+    np.testing.assert_array_equal(cleaned.log_density(z), missing.log_density(z))
 
 
 def test_a_record_full_of_outliers_is_refused() -> None:
-    posterior = short_posterior(samples=400)
-    noisy = spoilt(posterior, list(range(0, 400, 12)), 30.0)
+    noisy = spoilt(400, list(range(0, 400, 12)), 30.0)
     with pytest.raises(InputError, match="too many for isolated outliers"):
-        outliers(noisy.without, np.random.default_rng(8))
+        outliers(noisy, np.random.default_rng(8), NONE)
+
+
+def test_a_record_that_is_not_searched_keeps_its_readings() -> None:
+    assert outliers(spoilt(400, [300]), np.random.default_rng(8), {}) == {}
 
 
 # The posterior of several records: a sum over them, with what is shared there once.
@@ -422,8 +430,9 @@ def test_outliers_are_found_in_the_record_that_has_them() -> None:
     loops, slow = (dataset(name, "white", "none") for name in RECORDS)
     spoilt = slow.displacement.copy()
     spoilt[40] += 60.0
-    both = joint(loops, replace(slow, displacement=spoilt))
-    aside = outliers(both.without, np.random.default_rng(6))
+    both = study_of(loops, replace(slow, displacement=spoilt), noise="white")
+    suspects = dict.fromkeys(RECORDS, np.zeros(0, dtype=np.int64))
+    aside = outliers(both, np.random.default_rng(6), suspects)
     assert {"loops": [], "slow": [40]} == {name: rows.tolist() for name, rows in aside.items()}
 
 

@@ -25,11 +25,9 @@ from bwbayes.app.study.from_config import (
     validations_of,
     windows_of,
 )
-from bwbayes.arrays import IntArray
 from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputWarning
 from bwbayes.inference.outliers import outliers
-from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study, declarations_of, require_known
 from bwbayes.model.spec import ModelSpec
 from bwbayes.quantities import Quantities
@@ -186,25 +184,19 @@ def _without_outliers(config: Config, study: Study) -> tuple[Config, Study]:
 
     Their ranges would make the default priors, so these are made anew without them.
     """
-    complete = {n: study.records[n] for n, s in config.records.items() if s.outliers is None}
-
-    def without(rows: Mapping[str, IntArray]) -> Study:
-        left = {name: complete[name].without(outlying) for name, outlying in rows.items()}
-        return replace(study, records={**study.records, **left})
-
-    def posterior_without(rows: Mapping[str, IntArray]) -> Posterior:
-        return without({name: rows[name] for name in complete if name in rows}).posterior
-
-    rows = outliers(
-        posterior_without,
-        study.generator("outliers"),
-        {name: isolated_outliers(record, ends=True) for name, record in complete.items()},
-    )
+    suspects = {
+        name: isolated_outliers(study.records[name], ends=True)
+        for name, source in config.records.items()
+        if source.outliers is None
+    }
+    if not suspects:
+        return config, study
+    rows = outliers(study, study.generator("outliers"), suspects)
     sources = dict(config.records)
-    for name, record in complete.items():
-        times = record.time[rows[name]].tolist()
+    for name, outlying in rows.items():
+        times = study.records[name].time[outlying].tolist()
         sources[name] = sources[name].model_copy(update={"outliers": times})
-    return _with_records(config, sources), without({name: rows[name] for name in complete})
+    return _with_records(config, sources), study.without(rows)
 
 
 def _explicit(config: Config, study: Study) -> Run:
