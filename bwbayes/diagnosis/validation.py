@@ -163,7 +163,7 @@ class ValidationSummary:
     @classmethod
     def of(cls, validation: Iterable[BandValidation]) -> Self:
         """Summarize the validations of a run."""
-        return cls._of((verdict.passed, verdict.line) for verdict in validation)
+        return cls._of((outcome.passed, outcome.line) for outcome in validation)
 
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> Self:
@@ -243,15 +243,15 @@ def validate_bands(
     standard = StandardizedResiduals.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
     width = (standard.excess_width,) if bands.training and standard.excess_width else ()
-    verdict = BandValidation(bands.title, bands.training, True, notes=width)
+    validation = BandValidation(bands.title, bands.training, True, notes=width)
     # A lead-in that does not fit is noted only if the readings after it show a departure.
-    lead, doubted = bands.lead_in, verdict
+    lead, doubted = bands.lead_in, validation
     off = bool(reasons or standard.chances())
     if lead is not None and lead.p_value < LEAD_IN_ALARM and off:
         span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
         p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"
         note = f"the lead-in of {span} s does not fit the model ({p_value})"
-        doubted = replace(verdict, notes=(note, *width))
+        doubted = replace(validation, notes=(note, *width))
     if reasons:
         missed = any(reason.startswith("NRMSE") for reason in reasons)
         mending = [explanation for explanation in explanations if explanation.mends or not missed]
@@ -298,5 +298,5 @@ def validate_bands(
     return (
         replace(doubted, passed=None, reasons=tuple(doubts), cause=followed or better)
         if doubts
-        else verdict
+        else validation
     )

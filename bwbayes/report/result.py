@@ -152,7 +152,7 @@ class Result:
 
     @property
     def validation_numbers(self) -> dict[str, dict[str, Any]]:
-        """Scores, verdict and correction of all bands that have readings, by name."""
+        """Scores, validation and correction of all bands that have readings, by name."""
         numbers = {
             name: scores.numbers
             | (self.validation[name].summary if name in self.validation else {})

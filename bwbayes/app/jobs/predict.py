@@ -125,7 +125,7 @@ class Prediction(Product, Bands):
         return draw_styled(draw_bands, self, quantities=self.quantities)
 
     def numbers(self) -> dict[str, object]:
-        """Return what ``bwbayes predict`` writes beside the bands: scores, verdict, remarks."""
+        """Return what ``bwbayes predict`` writes beside the bands: scores, validation, remarks."""
         held: dict[str, object] = (
             {"passed": None} if self.validation is None else self.validation.summary
         )
@@ -226,7 +226,7 @@ def predict_another(
     watch(0.0)
     beyond = beyond_training(run.study.posterior, other.record.inputs)
     bands = _of_another(run, run.subset, other, name, beyond, part(watch, 0.0, 0.8))
-    verdict = validate_bands(bands, run.background, beyond=beyond)
+    validation = validate_bands(bands, run.background, beyond=beyond)
     bands = bands.with_scores(run.background.extent)
     from_rest_note = _from_rest_remark(run, other, bands, beyond)
     watch(1.0)
@@ -234,16 +234,16 @@ def predict_another(
     held = _held_lead_in_remark(run.study.spec, other, bands)
     notes = (noise, from_rest_note, held, *_notes(bands, beyond))
     remarks = tuple(note for note in notes if note)
-    if verdict is None or not verdict.passed:
+    if validation is None or not validation.passed:
         bands = replace(bands, correction=_of_drives_alike(run, held_out, beyond))
-    return Prediction(**vars(bands), validation=verdict, remarks=remarks)
+    return Prediction(**vars(bands), validation=validation, remarks=remarks)
 
 
 def correct_failed(run: Run, bands: Sequence[Bands]) -> tuple[Bands, ...]:
     """Return bands, those of held-out readings that fail validation with their correction."""
     held_out = [predicted for predicted in bands if not predicted.training]
     validation = validate_predictions(run, held_out, {})
-    failed = {name for name, verdict in validation.items() if verdict.passed is False}
+    failed = {name for name, outcome in validation.items() if outcome.passed is False}
     return tuple(
         replace(predicted, correction=correct(predicted)) if predicted.name in failed else predicted
         for predicted in bands
