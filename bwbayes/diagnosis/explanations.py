@@ -134,7 +134,7 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
                 lines(scene.study.spec, spec),
                 fit,
                 spec=spec,
-                coordinates=fit.coordinates,
+                place=fit.place,
             )
 
 
@@ -309,7 +309,8 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
 
 # On a good record a ratio of evidences exceeds k with a probability of at most 1/k (Markov's
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
-LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
+KINDS = len(ADDITIONS + CHANGES)
+LIMIT = float(np.log(100 * KINDS))
 
 # Odds of twenty to one, nats: explanations nearer than this, or a fit without any, are tied.
 TIED = float(np.log(20))

@@ -44,6 +44,11 @@ class LocalFit:
         return free
 
     @property
+    def place(self) -> dict[str, float]:
+        """The coordinates by the names of their parameters."""
+        return dict(zip(self.posterior.names, self.coordinates.tolist(), strict=True))
+
+    @property
     def rmse(self) -> float:
         """Root mean square of the readings minus the displacement, um."""
         residual = self.posterior.single_record.readings.values - self.displacement

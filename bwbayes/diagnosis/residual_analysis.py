@@ -77,7 +77,7 @@ class Explanation(Finding):
     parameter of the actuator, in sds of both fits. A ``foreign`` effect does not come from the
     actuator, so that a fit without it has followed it. An explanation by ``noise`` leaves the
     displacement as it is. ``spec`` is the model that it is a part of, ``stated`` holds the priors
-    of new parameters, ``coordinates`` (free,) are those of its fit, and ``cost`` is the cost of its
+    of new parameters, ``place`` has the coordinates of its fit by name, and ``cost`` is that of its
     choice, nats. ``advice`` is the fix that leaves the model as it is, if there is one.
     """
 
@@ -88,7 +88,7 @@ class Explanation(Finding):
     noise: bool = False
     spec: ModelSpec | None = None
     stated: Mapping[str, Stated] = field(default_factory=dict)
-    coordinates: FloatArray | None = field(default=None, repr=False, compare=False)
+    place: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
     cost: float = 0.0
     advice: str = ""
 
@@ -394,10 +394,10 @@ class ResidualAnalysis:
 
     def on_readings_of(self, posterior: Posterior) -> ResidualAnalysis:
         """Return the analysis of the readings of another model, which may follow fewer of them."""
-        fit, before = _on_readings(self.fit, posterior), self.before
+        fit, before = on_readings(self.fit, posterior), self.before
         if fit is self.fit:
             return self
-        return replace(self, fit=fit, before=before and _on_readings(before, posterior))
+        return replace(self, fit=fit, before=before and on_readings(before, posterior))
 
     def _of_whole(self, study: Study) -> Posterior:
         """Return the posterior of another model of the whole record."""
@@ -497,7 +497,7 @@ class ResidualAnalysis:
             shift=compared._shift(fit),
             spec=spec,
             stated=stated,
-            coordinates=fit.coordinates,
+            place=fit.place,
             advice=advice,
             **flags,
         )
@@ -508,12 +508,12 @@ class ResidualAnalysis:
             self.posterior.single_record.readings.rows.size
             < self.whole.single_record.readings.rows.size
         )
-        spec, coordinates = explanation.spec, explanation.coordinates
-        if not is_short or spec is None or coordinates is None:
+        spec, place = explanation.spec, explanation.place
+        if not is_short or spec is None or not place:
             return explanation
         other = self._of_whole(self.study.with_model(spec, explanation.stated))
-        fit = climb(other, coordinates, watch=self.watch)
-        before = _on_readings(self._on_all, other)
+        fit = climb(other, np.array([place[name] for name in other.names]), watch=self.watch)
+        before = on_readings(self._on_all, other)
         nats = fit.log_evidence - before.log_evidence - explanation.cost
         return replace(explanation, nats=nats, rmse=(before.rmse, fit.rmse))
 
@@ -561,7 +561,7 @@ class ResidualAnalysis:
         return float(np.max(moved, initial=0.0))
 
 
-def _on_readings(fit: LocalFit, other: Posterior) -> LocalFit:
+def on_readings(fit: LocalFit, other: Posterior) -> LocalFit:
     """Return a fit without the readings that another posterior of the record does not have."""
     missing = np.isnan(other.single_record.displacement)
     readings = fit.posterior.single_record.displacement

@@ -66,7 +66,8 @@ class Result:
     draws, log_density
         (steps, ensembles, walkers, free), parameters in their own units; (steps, ensembles,
         walkers), nats. Where a voltage has noise, or the instruments' scales are unsure, the draws
-        are the chain's made wider, and the density is that of the chain's own.
+        are the chain's made wider; where the record does not rule out other models, some are moved
+        to where those have them. The density is that of the chain's own.
     moves
         Numbers of proposals to a walker for these draws, and of acceptances, by kind of move.
     predictions, validation

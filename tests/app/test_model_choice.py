@@ -412,9 +412,13 @@ def test_models_that_tie_keep_what_the_search_did_later() -> None:
         replace(chosen, hold="zero"),
     ]
     ended = chosen.with_stages("backlash")
-    tied = [spec.chain for spec in explaining._tied(ended, [(chosen, others)])]
+
+    def chains(ended: ModelSpec, chosen: ModelSpec, *others: ModelSpec) -> list[tuple[str, ...]]:
+        causes = [Explanation("tie", "a tie", "none", nats=9.0, spec=other) for other in others]
+        found = explaining._tied(ended, [(chosen, causes)])
+        return [tied.spec.chain for tied in found if tied.spec]
+
+    tied = chains(ended, chosen, *others)
     assert tied == [("bouc-wen", "lag", "backlash", "sensor-lag"), ("duhem", "lag", "backlash")]
-    (left,) = explaining._tied(
-        base.with_stages("cubic"), [(base, [base.with_stages("cubic", "drift")])]
-    )
-    assert "drift" in left.chain
+    (left,) = chains(base.with_stages("cubic"), base, base.with_stages("cubic", "drift"))
+    assert "drift" in left

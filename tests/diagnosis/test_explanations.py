@@ -263,8 +263,8 @@ def test_a_late_column_is_named_with_its_delay_and_fitted_up_to_a_quarter_of_the
     assert found.spec is not None
     delayed = study.with_model(found.spec)
     assert not any("late" in finding.kind for finding in findings_of(delayed)["record"])
-    assert found.coordinates is not None
-    beside = ResidualAnalysis.of(delayed.posterior, found.coordinates[np.newaxis], rng, delayed)
+    place = np.array([[found.place[name] for name in delayed.posterior.names]])
+    beside = ResidualAnalysis.of(delayed.posterior, place, rng, delayed)
     assert [] == [*DEFECTS["sign"].explanations(beside)]
     fitted = judge(delayed, rng)
     for name in ("d", "alpha", "beta"):

@@ -72,6 +72,9 @@ if TYPE_CHECKING:
 # By this a chain notes what noise on the voltages leaves unsure: a covariance, (free, free).
 VOLTAGE_NOISE = "voltage_noise_covariance"
 
+# By this it notes the models that were not chosen, and that its record does not rule out.
+ALTERNATIVES = "alternatives"
+
 
 @dataclass(eq=False, repr=False)
 class Run(Shown):
@@ -221,7 +224,7 @@ class Run(Shown):
 
     @cached_property
     def flat_draws(self) -> FloatArray:
-        """All draws, (draws, free), parameters in their own units, as the readings have them."""
+        """All draws, (draws, free), of the chosen model, in their own units, as of the readings."""
         return self._draws.reshape(-1, self._draws.shape[-1])
 
     @cached_property
@@ -232,6 +235,18 @@ class Run(Shown):
             return draws(posterior, self.chain)
         covariances = self.chain.point.covariance, np.array(json.loads(str(noted)))
         return draws(posterior, self.chain, covariances=covariances)
+
+    @cached_property
+    def averaged(self) -> FloatArray:
+        """The draws as those of all models that the record does not rule out."""
+        noted = self.chain.attributes().get(ALTERNATIVES)
+        if noted is None:
+            return self._draws
+        from bwbayes.diagnosis.averaging import average, from_text
+
+        study, covariance = self.study, self.chain.point.covariance
+        others, source = from_text(str(noted)), study.generator("alternatives")
+        return average(study.posterior, self._draws, covariance, others, source)
 
     @cached_property
     def sampled(self) -> Result:
@@ -253,7 +268,7 @@ class Run(Shown):
             name=self.config.name or "run",
             outcome=self.outcome,
             parameters=study.parameters,
-            draws=study.true_draws(self._draws),
+            draws=study.true_draws(self.averaged),
             log_density=log_densities(chain),
             moves=chain.moves("sampling"),
             facts=self.facts | facts,

@@ -41,7 +41,8 @@ def check(
     """
     from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415  # slow to load
 
-    run, point, steps, explained = choose_model(resolve_config(config, folder, in_memory), watch)
+    chosen = choose_model(resolve_config(config, folder, in_memory), watch)
+    run, point, steps, explained = chosen.run, chosen.point, chosen.steps, chosen.explanations
     study, posterior = run.study, run.study.posterior
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = consistency.around(posterior.prior, point, study.generator("around"))

@@ -21,6 +21,7 @@ import numpy as np
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.resolve import with_model
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.averaging import Alternative, alternatives, remarks
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes, without
 from bwbayes.diagnosis.finding import TELLING_DRIVE
 from bwbayes.diagnosis.innovations import innovations
@@ -147,12 +148,14 @@ class ChosenModel(NamedTuple):
 
     ``steps`` say what was chosen, a line each; ``explanations`` are what would still explain each
     record's readings better, by its name, or None if that was not looked for to the end.
+    ``alternatives`` are models that were not chosen, and that the record does not rule out.
     """
 
     run: Run
     point: MAPEstimate
     steps: tuple[str, ...]
     explanations: dict[str, tuple[Explanation, ...]] | None
+    alternatives: Sequence[Alternative] = ()
 
 
 def choose_model(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
@@ -184,7 +187,7 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
         return ChosenModel(run, point, why, None)
     (name,) = run.study.records
     notes, steps = dict[str, str](), list[str]()
-    ties, is_over = dict[str, tuple[ModelSpec, list[ModelSpec]]](), False
+    ties, is_over = dict[str, tuple[ModelSpec, list[Explanation]]](), False
     while not is_over:
         step = partial(watch, f"stages, round {len(steps) + 1}")
         scene = _scene(run.study, name, point.optima)
@@ -213,8 +216,7 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
             added = (*new, chosen.kind)[0]
             gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
             notes[added], note = f"stage added: {gain}{_fix(parts)}", f"added: {gain}"
-            others = [cause.spec for cause in parts if cause.spec and cause is not chosen]
-            ties[added] = chosen.spec, others
+            ties[added] = chosen.spec, [cause for cause in parts if cause is not chosen]
         else:
             break
         steps.append(f"{note}, {clock():.0f} s")
@@ -222,30 +224,45 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
         spec = _reopened(chosen.spec) if is_open else chosen.spec
         open_run = with_model(open_run, spec, chosen.stated)
         run, point, why = _fitted(open_run, is_open, watch)
+        explanations = ()  # they were another model's
     refused = [cause for cause in likely_causes(models) if cause.misleads]
     steps += [f"not added: {cause.text} ({cause.worth})" for cause in refused]
     ended = [f"the search for stages ended after {seconds:g} s, before it was complete"] * is_over
-    steps += ended
-    remarks = [*notes.values(), *ended]
-    unexplained, discrepancy = None, _relative_discrepancy(run.study.posterior, point)
-    if len(notes) >= MAX_STAGES and discrepancy > MAX_DISCREPANCY:
-        unexplained = float(f"{discrepancy:.2g}")
-    elif len(notes) > MAX_STAGES or (notes and discrepancy > MAX_DISCREPANCY):
-        remarks.append(
-            "the search for stages may not have found the mechanism: the model error is still "
-            f"{discrepancy:.2g} times the sensor's noise, with {len(notes)} added; a drive unlike "
-            f"the training record's may be missed. Fix: {TELLING_DRIVE}."
-        )
+    unexplained, alarms = _unexplained(
+        len(notes), _relative_discrepancy(run.study.posterior, point)
+    )
     spec = run.study.spec
+    tied = [*_tied(spec, ties.values())]
+    weigh = partial(watch, "models that were not chosen")
+    others = alternatives(run.study, point.optima, (*explanations, *tied), weigh)
+    steps += [*ended, *remarks(others)]
     run = with_model(
         run,
         spec,
-        remarks=remarks,
+        remarks=[*notes.values(), *ended, *alarms, *remarks(others)],
         stages=spec.keys["stages"],
         unexplained=unexplained,
-        tied=[spec.changes_to(other) for other in _tied(spec, ties.values())],
+        tied=[spec.changes_to(other.spec) for other in tied if other.spec],
     )
-    return ChosenModel(run, point, (*steps, *why), None if is_over else {name: explanations})
+    found = None if is_over else {name: explanations}
+    return ChosenModel(run, point, (*steps, *why), found, others)
+
+
+def _unexplained(added: int, discrepancy: float) -> tuple[float | None, list[str]]:
+    """Tell whether a search found the mechanism: else return the discrepancy, or a remark on it.
+
+    It has ``added`` stages, and leaves a ``discrepancy``, sds of the sensor.
+    """
+    if added >= MAX_STAGES and discrepancy > MAX_DISCREPANCY:
+        return float(f"{discrepancy:.2g}"), []
+    if added > MAX_STAGES or (added and discrepancy > MAX_DISCREPANCY):
+        remark = (
+            "the search for stages may not have found the mechanism: the model error is still "
+            f"{discrepancy:.2g} times the sensor's noise, with {added} added; a drive unlike "
+            f"the training record's may be missed. Fix: {TELLING_DRIVE}."
+        )
+        return None, [remark]
+    return None, []
 
 
 def _fix(causes: Sequence[Explanation]) -> str:
@@ -281,21 +298,24 @@ def _reopened(spec: ModelSpec) -> ModelSpec:
 
 
 def _tied(
-    spec: ModelSpec, ties: Iterable[tuple[ModelSpec, Sequence[ModelSpec]]]
-) -> Iterator[ModelSpec]:
-    """Yield models with a stage that tied with one that was chosen, and all later changes.
+    spec: ModelSpec, ties: Iterable[tuple[ModelSpec, Sequence[Explanation]]]
+) -> Iterator[Explanation]:
+    """Yield explanations that tied with one that was chosen, beside all later changes.
 
-    ``ties`` are models that were chosen, and those that tied with them. A model with the same
-    stages predicts the same.
+    ``ties`` are models that were chosen, and what tied with them. A model with the same stages
+    predicts the same.
     """
     for chosen, others in ties:
         later = [stage for stage in spec.stages if stage not in chosen.stages]
         gone = {stage.name for stage in chosen.stages if stage not in spec.stages}
         for other in others:
-            tied = other.without(*gone.intersection(other.chain) - {other.operator.name})
+            assert other.spec is not None
+            tied = other.spec.without(
+                *gone.intersection(other.spec.chain) - {other.spec.operator.name}
+            )
             tied = replace(tied.with_stages(*later), hold=spec.hold, noise=spec.noise)
             if tied.chain != spec.chain:
-                yield tied
+                yield replace(other, spec=tied)
 
 
 def _size(study: Study, cause: Explanation) -> tuple[bool, int]:

@@ -19,12 +19,13 @@ from pathlib import Path
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run, open_finished
+from bwbayes.app.fit.fitted import ALTERNATIVES, VOLTAGE_NOISE, Run, open_finished
 from bwbayes.app.running.explaining import choose_model
 from bwbayes.app.running.fingerprint import fingerprint, require_own, save, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import FigureWorker, one_thread, open_executor
+from bwbayes.diagnosis import averaging
 from bwbayes.errors import InputError
 from bwbayes.inference import Engine, resolve_engine
 from bwbayes.inference.map_estimate import path_covariance
@@ -133,7 +134,7 @@ def _open_chain(run: Run, console: Console, requested: Engine | None = None) -> 
     if not folder.chain.exists():
         config_before = run.config
         with StepProgress(console, "choosing the model ...") as watch:
-            run, point, steps, explanations = choose_model(run, watch)
+            run, point, steps, explanations, others = choose_model(run, watch)
             study, posterior = run.study, run.study.posterior
             paths = {name: record.path for name, record in study.records.items()}
             unsure: dict[str, str] = {}
@@ -141,7 +142,9 @@ def _open_chain(run: Run, console: Console, requested: Engine | None = None) -> 
                 source = study.generator("voltage noise")
                 watch_noise = partial(watch, "noise on the voltage")
                 covariance = path_covariance(posterior, paths, point, source, watch_noise)
-                unsure = {VOLTAGE_NOISE: json.dumps(covariance.tolist())}
+                unsure[VOLTAGE_NOISE] = json.dumps(covariance.tolist())
+            if others:
+                unsure[ALTERNATIVES] = averaging.to_text(others)
         for step in map(study.quantities.say, steps):
             console.print(step, highlight=False, soft_wrap=True)
         if run.config != config_before:
