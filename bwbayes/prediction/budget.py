@@ -33,12 +33,13 @@ from bwbayes.prediction.prediction import stratified_scores
 from bwbayes.record.instruments import Instruments, Scales
 
 NOISE, MODEL, STATE = "readings' noise", "model error", "initial state"
+CHOICE = "choice of the model"
 SENSOR, AMPLIFIER, CURVE = "sensor scale", "amplifier gain", "sensor linearity"
 PRIOR, CREEP = "prior", "creep beyond the record"
 
 # How each is evaluated, as JCGM 100 calls it: A from the readings, B from what else is known.
 TYPES: Mapping[str, str] = {
-    **dict.fromkeys((NOISE, MODEL, STATE), "A"),
+    **dict.fromkeys((NOISE, MODEL, STATE, CHOICE), "A"),
     **dict.fromkeys((SENSOR, AMPLIFIER, CURVE, PRIOR, CREEP), "B"),
 }
 
@@ -123,7 +124,8 @@ def uncertainty_budgets(
         explained = variance
         if quantity.unexplained:
             explained = float(np.mean((moved @ slopes) ** 2))
-            shares[quantity.unexplained] += max(variance - explained, 0.0) / max(explained, 1e-300)
+            rest = max(variance - explained, 0.0) / max(explained, 1e-300)
+            shares[quantity.unexplained] = shares.get(quantity.unexplained, 0.0) + rest
         variances = {source: share * explained for source, share in shares.items()}
         mean = float(np.mean(quantity.values))
         relative_sds = instruments.relative_sds(quantity.unit)

@@ -12,6 +12,7 @@ from bwbayes.calibration.calibration import replicate
 from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.prediction.budget import (
     AMPLIFIER,
+    CHOICE,
     CURVE,
     MODEL,
     NOISE,
@@ -162,3 +163,19 @@ def test_budget_is_that_of_the_closed_form(linear: Linear) -> None:
     assert scaled[0] / of_d.sd**2 == pytest.approx(of_d.shares[SENSOR], rel=1e-9)
     assert scaled[1] / of_d.sd**2 == pytest.approx(of_d.shares[AMPLIFIER], rel=1e-9)
     assert CURVE not in of_d.shares
+
+
+def test_what_other_models_move_draws_by_is_the_choice_of_the_model(linear: Linear) -> None:
+    """A tenth of the draws is 3 sds away: w (1 - w) 3² of the sampled variance is added."""
+    draws = linear.exact.draw(4000, seed=4)
+    elsewhere = np.random.default_rng(5).random(4000) < 0.1
+    moved = draws[:, 0] + 3 * linear.exact.sd[0] * elsewhere
+    scales = EXACT.scales(4000, np.random.default_rng(1))
+    shares = []
+    for values in (draws[:, 0], moved):
+        quantity = Measurand("d", "um/V", values, unexplained=CHOICE)
+        (budget,) = uncertainty_budgets(linear.posterior, draws, [quantity], EXACT, scales)
+        shares.append(budget.shares.get(CHOICE, 0.0))
+        assert budget.sd == pytest.approx(np.std(values), rel=1e-9)
+    assert shares[0] < 1e-6
+    assert shares[1] == pytest.approx(0.81 / 1.81, rel=0.1)

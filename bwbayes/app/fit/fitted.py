@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from bwbayes.app.running.workers import FigureWorker
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.comparison import Comparison
+    from bwbayes.diagnosis.averaging import Alternative
     from bwbayes.diagnosis.consistency import Consistency
     from bwbayes.diagnosis.finding import Finding
     from bwbayes.diagnosis.identifiability import InformationGain
@@ -239,14 +240,23 @@ class Run(Shown):
     @cached_property
     def averaged(self) -> FloatArray:
         """The draws as those of all models that the record does not rule out."""
-        noted = self.chain.attributes().get(ALTERNATIVES)
-        if noted is None:
+        if not self.alternatives:
             return self._draws
-        from bwbayes.diagnosis.averaging import average, from_text
+        from bwbayes.diagnosis.averaging import average
 
         study, covariance = self.study, self.chain.point.covariance
-        others, source = from_text(str(noted)), study.generator("alternatives")
-        return average(study.posterior, self._draws, covariance, others, source)
+        source = study.generator("alternatives")
+        return average(study.posterior, self._draws, covariance, self.alternatives, source)
+
+    @cached_property
+    def alternatives(self) -> list[Alternative]:
+        """The models that were not chosen, and that the record does not rule out."""
+        noted = self.chain.attributes().get(ALTERNATIVES)
+        if noted is None:
+            return []
+        from bwbayes.diagnosis.averaging import from_text
+
+        return from_text(str(noted))
 
     @cached_property
     def sampled(self) -> Result:

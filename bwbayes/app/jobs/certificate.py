@@ -28,6 +28,7 @@ from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.budget import (
+    CHOICE,
     CREEP,
     CURVE,
     MODEL,
@@ -43,6 +44,7 @@ from bwbayes.prediction.initial_state import (
     training_initial_states,
 )
 from bwbayes.prediction.loops import MEASURES
+from bwbayes.prediction.prediction import thin_draws
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -293,7 +295,10 @@ def _estimates(fit: Run) -> list[dict[str, Any]]:
 
 
 def run_budgets(run: Run) -> tuple[Budget, ...]:
-    """Return the budgets of a run from half of its draws as the readings have them."""
+    """Return the budgets of a run from half of its draws as the readings have them.
+
+    A parameter's has the draws of all models that the record does not rule out.
+    """
     study, draws, predictions = run.study, run.subset[::2], run.predictions
     posterior, instruments = study.posterior, study.record.instruments
     shown = next((bands for bands in predictions if not bands.training), predictions[0])
@@ -304,8 +309,10 @@ def run_budgets(run: Run) -> tuple[Budget, ...]:
     ]
     name = "d" if "d" in actuators else [*actuators, *posterior.names][0]
     unit = next(p.unit for p in study.parameters if p.name == name)
+    of_all = run.averaged[..., posterior.names.index(name)].reshape(-1, 1)
+    values = thin_draws(of_all, study.generator("draws"))[::2, 0]  # of the same draws
     quantities = [
-        Measurand(name, unit, draws[:, posterior.names.index(name)]),
+        Measurand(name, unit, values, unexplained=CHOICE if run.alternatives else ""),
         loop_width(posterior, draws),
         _displacement(run, draws, shown),
     ]
