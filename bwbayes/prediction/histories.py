@@ -190,30 +190,37 @@ class States:
     and the highest as far out as any drive leaves them: half of the drives went over the whole
     range, half over any part of it. A drive over its lower part alone leaves states above those of
     the whole range: on the way up it has had less to make up for.
+
+    Each θ (draws, parameters) is there ``tries`` times in a row: what its drives leave is the same.
     """
 
-    def __init__(self, likelihood: Likelihood, theta: FloatArray) -> None:
-        self.table, self.theta = likelihood.table, theta
-        self.quantiles = np.array([0.0, 0.25, 0.75, 1.0])
+    def __init__(self, likelihood: Likelihood, theta: FloatArray, tries: int = 1) -> None:
+        self.table, self.theta = likelihood.table, np.repeat(theta, tries, axis=0)
+        self.quantiles, ordered = self._reached(likelihood, theta)
+        self.ordered = np.repeat(ordered, tries, axis=1)
+
+    @staticmethod
+    def _reached(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return quantiles (nodes,) and the states (nodes, draws) there."""
+        quantiles = np.array([0.0, 0.25, 0.75, 1.0])
         if likelihood.from_rest:
-            self.ordered = np.zeros((4, len(theta)))
-            return
+            return quantiles, np.zeros((4, len(theta)))
         actuator, span = likelihood.actuator, likelihood.actuator.range_of(likelihood.voltage)
-        column, inputs = self.table.columns(theta), likelihood.inputs
+        column, inputs = likelihood.table.columns(theta), likelihood.inputs
         # As the stages before the hysteresis pass it on: a delay may be a quarter of a period.
         memories = actuator.begin_inputs(column, inputs, from_rest=False)
         voltage = float(np.mean(actuator.pass_inputs(column, inputs[:1], memories)[0]))
         low, high = actuator.hysteresis.reachable(column, voltage, span)
-        self.ordered = np.stack([low, low, high, high])
-        if not actuator.hysteresis.remembers_range:
-            ends = np.linspace(*span, 9).tolist()
-            ranges = [Span(*pair) for pair in combinations(ends, 2)]
-            states = [actuator.hysteresis.left(column, voltage, swept) for swept in ranges]
-            widest = [actuator.hysteresis.left(column, voltage, span)] * len(ranges)
-            self.ordered = np.sort(np.concatenate(states + widest), axis=0)
-            self.ordered[0] = np.minimum(self.ordered[0], low)
-            self.ordered[-1] = np.maximum(self.ordered[-1], high)
-            self.quantiles = np.linspace(0.0, 1.0, len(self.ordered))
+        if actuator.hysteresis.remembers_range:
+            return quantiles, np.stack([low, low, high, high])
+        ends = np.linspace(*span, 9).tolist()
+        ranges = [Span(*pair) for pair in combinations(ends, 2)]
+        states = [actuator.hysteresis.left(column, voltage, swept) for swept in ranges]
+        widest = [actuator.hysteresis.left(column, voltage, span)] * len(ranges)
+        ordered = np.sort(np.concatenate(states + widest), axis=0)
+        ordered[0] = np.minimum(ordered[0], low)
+        ordered[-1] = np.maximum(ordered[-1], high)
+        return np.linspace(0.0, 1.0, len(ordered)), ordered
 
     @property
     def open(self) -> bool:
@@ -279,9 +286,8 @@ def choose_together(
     16 (2006) 239-249.)
     """
     draws = len(theta)
-    theta = np.repeat(theta, TRIES, axis=0)
-    every = np.arange(len(theta))
-    states = [States(likelihood, theta) for likelihood in likelihoods]
+    states = [States(likelihood, theta, TRIES) for likelihood in likelihoods]
+    every = np.arange(draws * TRIES)
 
     def started(scores: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return histories and θ of normal scores (tries, 2 + unknowns)."""
@@ -300,7 +306,7 @@ def choose_together(
         )
         return np.maximum(np.nan_to_num(values, nan=-np.inf, posinf=-np.inf), -1e300)
 
-    scores = generator.standard_normal((len(theta), 2 + len(unknowns)))
+    scores = generator.standard_normal((every.size, 2 + len(unknowns)))
     log, evidence, power = density(scores), np.zeros(draws), 0.0
     while power < 1.0:
         away = log.reshape(draws, TRIES)

@@ -227,6 +227,17 @@ def test_states_are_of_the_voltage_that_the_hysteresis_sees() -> None:
     np.testing.assert_allclose(States(late, shifted).ordered, later.ordered)
 
 
+def test_states_of_tries_are_those_of_their_draw() -> None:
+    posterior = posterior_of_case(Case())
+    likelihood = replace(posterior.likelihood, from_rest=False)
+    rng = np.random.default_rng(3)
+    theta = np.repeat(posterior.prior.theta(np.empty((1, 0))), 5, axis=0)
+    theta = likelihood.table.replaced(theta, "beta", rng.uniform(0.02, 0.05, 5))
+    tried, repeated = States(likelihood, theta, 4), States(likelihood, np.repeat(theta, 4, axis=0))
+    quantile = rng.uniform(size=20)
+    np.testing.assert_allclose(tried.at(quantile), repeated.at(quantile))
+
+
 def level_error(seed: int) -> tuple[float, float]:
     """Predict a record that goes less far than the irregular drive before it, by one offset.
 
