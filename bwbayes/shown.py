@@ -72,12 +72,12 @@ def _value(value: Any, *, nested: bool = True) -> str:
         elif value.dtype.kind in "iuf" and np.isfinite(value).any():
             finite = value[np.isfinite(value)]
             text += f" from {finite.min():.4g} to {finite.max():.4g}"
-        return _cut(text)
+        return _cut_text(text)
     if isinstance(value, Mapping):
         items = (f"{key!r}: {_value(item, nested=False)}" for key, item in value.items())
-        return _joined("{", items, len(value), "}")
+        return _join_items("{", items, len(value), "}")
     if isinstance(value, list | tuple | set | frozenset):
-        return _joined("[", (_value(item, nested=False) for item in value), len(value), "]")
+        return _join_items("[", (_value(item, nested=False) for item in value), len(value), "]")
     if nested and is_dataclass(value) and not isinstance(value, type):
         parts = [f"{name}={_value(item, nested=False)}" for name, item in _fields(value)]
         line = f"{type(value).__name__}({', '.join(parts)})"
@@ -87,11 +87,11 @@ def _value(value: Any, *, nested: bool = True) -> str:
     if plain is None or isinstance(
         plain, bool | int | float | complex | str | bytes | slice | Path
     ):
-        return f"{plain:.6g}" if isinstance(plain, float) else _cut(repr(plain))
+        return f"{plain:.6g}" if isinstance(plain, float) else _cut_text(repr(plain))
     return str(getattr(value, "__name__", f"{type(value).__name__}(...)"))
 
 
-def _joined(opening: str, items: Iterator[str], count: int, closing: str) -> str:
+def _join_items(opening: str, items: Iterator[str], count: int, closing: str) -> str:
     """Return the first items of a collection, as many as there is room for, and how many more."""
     shown: list[str] = []
     for item in items:
@@ -102,5 +102,5 @@ def _joined(opening: str, items: Iterator[str], count: int, closing: str) -> str
     return f"{opening}{', '.join([*shown, *more])}{closing}"
 
 
-def _cut(text: str) -> str:
+def _cut_text(text: str) -> str:
     return text if len(text) <= VALUE else f"{text[: VALUE - 3]}..."

@@ -23,7 +23,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray, select
-from bwbayes.control.exported import exported
+from bwbayes.control.exported import export_model
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES, DiscrepancyNoise, noise_model
 from bwbayes.inference.parameters import ParameterTable
@@ -302,7 +302,7 @@ def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) 
     displacement = actuator.displacement(theta, voltage, from_rest=True)
     back = inverse(actuator, theta, displacement, from_rest=True)
     np.testing.assert_allclose(back, np.broadcast_to(voltage, back.shape), atol=1e-8)
-    made_for = exported("bent", actuator, theta[0], Limits(-100.0, 100.0))
+    made_for = export_model("bent", actuator, theta[0], Limits(-100.0, 100.0))
     assert BENT == made_for.numbers()["parts"]["hysteresis"]
     compiled = Compiled(made_for, tmp_path, needs("cc"))
     got = compiled.run("forward", voltage[0], voltage)

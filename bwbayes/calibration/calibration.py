@@ -219,7 +219,7 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     """
     generator = np.random.default_rng([seed, number])
     simulating, fitting, sampling, choosing, predicting, others = generator.spawn(6)
-    theta, simulated = _simulated(experiment, simulating)
+    theta, simulated = _simulate_truth(experiment, simulating)
     readings = {
         name: record.displacement
         for name, (record, _) in simulated.items()
@@ -280,7 +280,7 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     return Replicate(entry, drawn)
 
 
-def _simulated(
+def _simulate_truth(
     experiment: CalibrationSetup, generator: np.random.Generator
 ) -> tuple[dict[str, FloatArray], dict[str, Simulated]]:
     """Draw a truth; return it by parameter, (1,) each, and its records by name."""

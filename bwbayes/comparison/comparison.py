@@ -492,7 +492,7 @@ def _is_known(candidate: Candidate) -> bool:
     return candidate.evidence is not None and candidate.evidence.error < 0.5
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_of(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
@@ -501,7 +501,7 @@ def _summarize(comparison: Comparison) -> Iterator[str]:
     recommended, tied = comparison[str(comparison.recommended)], comparison.tied
     screened = [candidate.name for candidate in comparison.candidates if candidate.screened]
     if tied:
-        names = _listed([recommended.name, *tied])
+        names = _list_of([recommended.name, *tied])
         are_known = all(_is_known(comparison[name]) for name in (recommended.name, *tied))
         why = "most probable" if are_known else "simplest"
         yield f"{names} are indistinguishable; {recommended.name} is the {why}"
@@ -518,7 +518,7 @@ def _summarize(comparison: Comparison) -> Iterator[str]:
         nearest = comparison.differences[worse[0]]
         which = f"{worse[0]} " if len(worse) > 1 else ""
         yield (
-            f"by the {comparison.measure} {_listed(worse)} {'is' if len(worse) == 1 else 'are'} "
+            f"by the {comparison.measure} {_list_of(worse)} {'is' if len(worse) == 1 else 'are'} "
             f"worse, {which}by {with_error(-nearest.value, nearest.error)} nats"
         )
     others = [n for n in comparison.differences if n not in (*worse, recommended.name, *tied)]
@@ -528,11 +528,11 @@ def _summarize(comparison: Comparison) -> Iterator[str]:
             evidence[name] for name in others
         )
         yield (
-            f"the {comparison.measure} does not tell {_listed(others)} apart, "
+            f"the {comparison.measure} does not tell {_list_of(others)} apart, "
             f"but the log evidence is lower by {margin:.1f} nats or more"
         )
     if screened:
-        yield f"only screened, as too far behind at the MAP estimate: {_listed(screened)}"
+        yield f"only screened, as too far behind at the MAP estimate: {_list_of(screened)}"
 
 
 def _list_caveats(comparison: Comparison) -> Iterator[str]:

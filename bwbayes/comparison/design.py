@@ -450,17 +450,19 @@ def rank_designs(
     possible = np.isfinite(prior.constrain(proposed)[1])
     chosen[possible] = proposed[possible]
 
-    def targeted(places: FloatArray) -> FloatArray:
+    def target_values(places: FloatArray) -> FloatArray:
         if isinstance(target, str):
             return prior.constrain(places)[0][:, [prior.free_names.index(target)]]
         return band.displacement(*prior.theta_at(places))
 
-    band = _planned(
+    band = _planned_posterior(
         posterior, posterior.single_record.voltage if isinstance(target, str) else target
     )
     factor = np.linalg.cholesky(covariance)
-    gradients = [value_and_jacobian(targeted, point[np.newaxis], columns)[1][0] for point in chosen]
-    values = targeted(chosen)
+    gradients = [
+        value_and_jacobian(target_values, point[np.newaxis], columns)[1][0] for point in chosen
+    ]
+    values = target_values(chosen)
     if isinstance(target, str):
         unit = prior.free[prior.free_names.index(target)].unit
         relative = float(np.hypot(*instruments.relative_sds(unit)))
@@ -476,7 +478,7 @@ def rank_designs(
         if refused:
             scores.append(DesignScore(name, np.nan, np.nan, refused))
             continue
-        planned, remaining = Target(_planned(posterior, voltage)), []
+        planned, remaining = Target(_planned_posterior(posterior, voltage)), []
         rows, unknown = (np.searchsorted(planned.physical, c) for c in (columns, new))
         this = part(watch, number / count, (number + 1) / count)
         for batch in watched([*batches(len(chosen), 2 * len(scopes) * voltage.size)], this):
@@ -498,7 +500,7 @@ def rank_designs(
     return sorted(scores, key=lambda score: (bool(score.refused), score.sd_ratio, score.name))
 
 
-def _planned(posterior: Posterior, voltage: FloatArray) -> Posterior:
+def _planned_posterior(posterior: Posterior, voltage: FloatArray) -> Posterior:
     """Return the posterior of another record of one actuator, of which only readings are missing.
 
     It starts as the one that was fitted.

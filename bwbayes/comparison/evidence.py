@@ -301,10 +301,10 @@ def leave_future_out(
         rows = {name: dataset.readings.rows for name, dataset in datasets.items()}
         later = {name: readings[readings.size // 2 :] for name, readings in rows.items()}
         path = _path(posterior, dict.fromkeys(training, ()), training, later)
-        earlier = _fitted(path[0], plan, flat, rng, executor, partial(watch, "earlier training"))
+        earlier = _redraw(path[0], plan, flat, rng, executor, partial(watch, "earlier training"))
         if earlier is not None:
             scoring = partial(watch, FUTURE)
-            parts[FUTURE] = _scored(path, {0: earlier, BLOCKS: flat}, later, rng, scoring)
+            parts[FUTURE] = _score_blocks(path, {0: earlier, BLOCKS: flat}, later, rng, scoring)
     for record, named in held_out.items():
         for name, windows in named.items():
             window_rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
@@ -313,14 +313,14 @@ def leave_future_out(
                 continue
             path = _path(posterior, training, {record: windows}, later)
             training = {dataset.name: dataset.training for dataset in path[-1].datasets}
-            score = _scored(path, {0: flat}, later, rng, partial(watch, name))
+            score = _score_blocks(path, {0: flat}, later, rng, partial(watch, name))
             # Too few draws are effective at the far end: that end is sampled too.
             if score.effective < 100:
                 again = partial(watch, f"training and {name}")
-                longer = _fitted(path[-1], plan, flat, rng, executor, part(again, 0.0, 0.8))
+                longer = _redraw(path[-1], plan, flat, rng, executor, part(again, 0.0, 0.8))
                 if longer is not None:
                     drawn = {0: flat, BLOCKS: longer}
-                    score = _scored(path, drawn, later, rng, part(again, 0.8, 1.0))
+                    score = _score_blocks(path, drawn, later, rng, part(again, 0.8, 1.0))
                     flat = longer
             parts[name] = score
     return parts
@@ -344,7 +344,7 @@ def _path(
             later_windows = [slice(w.start, min(w.stop, end)) for w in added[name] if w.start < end]
             fitted = [*training[name], *later_windows]
             windows[name] = tuple(sorted(fitted, key=lambda window: window.start))
-        path.append(posterior.trained(windows))
+        path.append(posterior.with_training(windows))
     return path
 
 
@@ -406,7 +406,7 @@ def log_ratios(
     return ratios - ratios[0], effective
 
 
-def _scored(
+def _score_blocks(
     path: Sequence[Posterior],
     drawn: Mapping[int, FloatArray],
     rows: Mapping[str, IntArray],
@@ -430,7 +430,7 @@ def _scored(
     return Part(np.diff(log_z), readings, size, effective=float(np.min(effective)))
 
 
-def _fitted(
+def _redraw(
     posterior: Posterior,
     plan: SamplingPlan,
     flat: FloatArray,
@@ -451,13 +451,13 @@ def _fitted(
     chain = init_chain(posterior, point, short, rng)
     share = 0.0
 
-    def checked(_: Phase, check: ConvergenceDiagnostics | None) -> None:
+    def report_progress(_: Phase, check: ConvergenceDiagnostics | None) -> None:
         nonlocal share
         if check is not None:
             share = max(share, min(float(np.nan_to_num(check.lowest_ess)) / short.ess, 1.0))
         watch(share)
 
-    if not sample(posterior, short, chain, executor, checked).converged:
+    if not sample(posterior, short, chain, executor, report_progress).converged:
         return None
     return draws(posterior, chain).reshape(-1, len(posterior.names))
 

@@ -87,7 +87,7 @@ class _Plan:
     def record(self, voltage: FloatArray) -> Record:
         """Return a command as a record."""
         name = self.reference.name
-        record = planned(voltage, self.reference, self.hold, name, self.conditions)
+        record = command_record(voltage, self.reference, self.hold, name, self.conditions)
         return replace(record, instruments=self.instruments)
 
     def initial_states(self, voltage: FloatArray) -> InitialStates:
@@ -432,7 +432,7 @@ class Compensation(Product):
     def record(self) -> Record:
         """The command as a record that a signal generator can play; it states its limits."""
         origin = f"command for {self.reference.name}; amplifier {self.limits}"
-        return planned(self.voltage, self.reference, self.hold, origin, self.conditions)
+        return command_record(self.voltage, self.reference, self.hold, origin, self.conditions)
 
     def records(self) -> dict[str, Record]:
         """Return the command by the name of its file."""
@@ -631,7 +631,7 @@ def facts_of(conditions: Mapping[str, float]) -> list[tuple[str, str]]:
     return [(name, f"{value:.6g}, constant") for name, value in conditions.items()]
 
 
-def planned(
+def command_record(
     voltage: FloatArray,
     reference: Reference,
     hold: Hold,

@@ -522,7 +522,7 @@ class Exported(Product):
         return next((name for name, operator in HYSTERESIS.items() if operator is kind), path)
 
 
-def exported(
+def export_model(
     name: str,
     actuator: Actuator,
     theta: FloatArray,

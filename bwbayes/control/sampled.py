@@ -277,7 +277,7 @@ class SampledModel:
     def displacement(self, state: SteppedState) -> FloatArray:
         """Return the displacement (models,), um, that a held voltage has led to."""
         moved = np.sum(self.taps[:, 5] * (state.equilibrium + state.filters[:, 0]), axis=0)
-        return _passed(self.outputs[0], state.outputs, moved)[0] - self.zero
+        return _pass_stages(self.outputs[0], state.outputs, moved)[0] - self.zero
 
     def forward(self, state: SteppedState, voltage: FloatArray) -> tuple[FloatArray, SteppedState]:
         """Return the displacement (models,), um, at a sample with this voltage, and the state.
@@ -286,11 +286,11 @@ class SampledModel:
         """
         memory, _, initial, filters, *_ = state
         after, filtered = np.empty_like(memory), np.empty_like(filters)
-        driven, inputs = _passed(self.inputs[0], state.inputs, voltage)
+        driven, inputs = _pass_stages(self.inputs[0], state.inputs, voltage)
         moved = advance(
             *self.hysteresis, self.taps, memory, initial, filters, driven, after, filtered
         )
-        moved, outputs = _passed(self.outputs[0], state.outputs, moved)
+        moved, outputs = _pass_stages(self.outputs[0], state.outputs, moved)
         return moved - self.zero, SteppedState(after, voltage, initial, filtered, inputs, outputs)
 
     def inverse(
@@ -384,7 +384,7 @@ class SampledModel:
         return reduce(add, systems)  # side by side
 
 
-def _passed(
+def _pass_stages(
     row: Sequence[SampledStage], memories: Sequence[FloatArray], value: FloatArray
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
     """Let a value (models,) pass stages in a row; return what comes out, and their memories."""

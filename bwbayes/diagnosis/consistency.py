@@ -292,7 +292,7 @@ def conflicts(
             finding = _disagreement(parameter, columns[parameter.name], default)
         if finding:
             findings.append(finding)
-    return [*findings, *_pressed(prior, columns)]
+    return [*findings, *_pressed_bounds(prior, columns)]
 
 
 def _another_unit(parameter: Parameter, default: Distribution) -> Finding | None:
@@ -335,7 +335,7 @@ def _disagreement(
         widths, stated = ("sd", "sigma", "scale"), parameter.prior
         double = {k: 2 * v if k in widths else v for k, v in stated.arguments.items()}
         wider = Distribution(stated.name, double)
-    if wider == parameter.prior:  # the prior ends at a bound; `_pressed` reports that
+    if wider == parameter.prior:  # the prior ends at a bound; `_pressed_bounds` reports that
         return None
     return Finding(parameter.name, text, conflict_fix(parameter.name, wider))
 
@@ -346,7 +346,7 @@ def conflict_fix(name: str, wider: Distribution) -> str:
     return f"check the units of prior and record; if both are right, give {line}"
 
 
-def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[Finding]:
+def _pressed_bounds(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[Finding]:
     """Yield bounds that the posterior presses on: a parameter's own, and those others set."""
     fixed = {p.name: p.fixed for p in prior.parameters if p.fixed is not None}
     size = next(iter(columns.values())).size

@@ -162,9 +162,9 @@ class StandardizedResiduals:
         # A band that misses most of the readings has failed, unless chance may explain their
         # residuals even if all of them together are worth one independent reading.
         single = scipy.stats.f.sf(np.mean(self.z**2), 1, self.noise_size)
-        limit = DOUBT if self._covered(95) < 0.5 and single < DOUBT else ALARM
+        limit = DOUBT if self._share_inside(95) < 0.5 and single < DOUBT else ALARM
         reasons = [
-            *self._reversed(span),
+            *self._find_reversed(span),
             *(text for text, chance in self.chances() if chance < limit),
         ]
         # Test for five readings six sds off, so that a long record does not hide a bad start or
@@ -260,7 +260,7 @@ class StandardizedResiduals:
         residual: FloatArray = (self.bands.measured - self.bands.mean)[self.scored]
         return residual
 
-    def _covered(self, level: int) -> float:
+    def _share_inside(self, level: int) -> float:
         """Return the part of the readings in a sensor band."""
         assert self.bands.measured is not None
         return float(np.mean(self.bands.covers("sensor", level, self.bands.measured)[self.scored]))
@@ -270,7 +270,7 @@ class StandardizedResiduals:
         # Equally probable factors on the noise's sd, within the fit's uncertainty.
         scales = np.empty(0)
         for level in reversed(LEVELS):
-            covered, nominal = self._covered(level), level / 100
+            covered, nominal = self._share_inside(level), level / 100
             odds = covered / max(1 - covered, 1e-12) * (1 - nominal) / nominal
             if odds >= 1 / ODDS:
                 continue
@@ -284,7 +284,7 @@ class StandardizedResiduals:
             text = f"the {level}% sensor band covers {percent(covered)} of readings"
             yield text, float(np.mean(chances))
 
-    def _reversed(self, span: tuple[float, float]) -> Iterator[str]:
+    def _find_reversed(self, span: tuple[float, float]) -> Iterator[str]:
         """Find readings that go against the voltage, if it goes up and down by enough.
 
         A model with a lag of many seconds and an absurd gain can follow even these.

@@ -148,7 +148,7 @@ def beyond_training(
     return findings
 
 
-def unexcited(findings: Iterable[Finding]) -> str:
+def unexcited_note(findings: Iterable[Finding]) -> str:
     """Name a drive's excitations that the training record lacks; return "" without any."""
     names = {"speed": "fast edges", "slow": "slow holds"}
     kinds = [names[finding.kind] for finding in findings if finding.kind in names]

@@ -1,6 +1,6 @@
 """Parameters and combinations that a record does not identify, before and after sampling.
 
-Before, by Fisher's information at a point fit (:func:`undetermined`). Every fit leaves a
+Before, by Fisher's information at a point fit (:func:`undetermined_directions`). Every fit leaves a
 discrepancy of about a percent of the range, which comes back whenever the voltage repeats itself: a
 hundred periods of one sine show one loop, not a hundred. So each distinct branch of the voltage
 counts once, under a discrepancy of that percent. The posterior itself, which assumes that the noise
@@ -43,7 +43,7 @@ USUAL_ERROR = 0.01
 LEFT_OPEN = 1 / 3
 
 
-def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
+def undetermined_directions(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
     """Yield the combinations of loop parameters that the record determines least, two at most.
 
     For each, more than a third of the prior's sd is left at a point fit; the finding says how much,
@@ -72,11 +72,11 @@ def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
         advice = "vary the amplitude: let it decay to a tenth over ten periods"
     for i in range(min(count, 2)):
         text = (
-            f"{combined(directions[:, i], names)}: {remaining(parts[i])} if the model is off by "
+            f"{in_words(directions[:, i], names)}: {remaining(parts[i])} if the model is off by "
             f"{USUAL_ERROR:.0%} of the range"
         )
         if i == count - 1 < parts.size - 1:
-            text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
+            text += f" (next {in_words(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
         elif i == 1:
             text += f", and more than {percent(LEFT_OPEN)} of {count - 2} other combinations"
         yield Finding("not identifiable", text, advice)
@@ -180,7 +180,7 @@ def stretches_once(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, flo
     return weights, voltage.size / len(stretches)
 
 
-def combined(direction: FloatArray, names: Sequence[str]) -> str:
+def in_words(direction: FloatArray, names: Sequence[str]) -> str:
     """Name a direction (names,) in words, the largest component first.
 
     ``alpha with beta`` means that both may grow together, ``alpha against beta`` that one grows
@@ -334,6 +334,6 @@ def information_gain(
         if sd >= LEFT_OPEN:
             # Name the joint move of the scores along the direction, not the direction's weights.
             combinations.append(
-                (combined(posterior_covariance @ directions[:, i], prior.free_names), sd)
+                (in_words(posterior_covariance @ directions[:, i], prior.free_names), sd)
             )
     return InformationGain(parameters, tuple(combinations))

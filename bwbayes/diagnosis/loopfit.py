@@ -99,12 +99,12 @@ def fit_loop(record: Record) -> LoopFit:
     among_columns = _products(columns, columns)
 
     lags, fits = _lags(record), []
-    lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
+    lagged_voltages = [_lag_voltage(record.voltage, lag / record.interval)[rows] for lag in lags]
     for lag, loops in zip(lags, _bases(np.array(lagged_voltages), has_reading), strict=True):
         basis = np.column_stack([loops, trend_shape])
         fits.append((*_best_decay(basis, columns, among_columns), basis, float(lag)))
     remainder, _, basis, lag = min(fits, key=lambda fit: fit[0])
-    creep, slow = _slow(_lagged(record.voltage, lag / record.interval), rows[has_reading])
+    creep, slow = _slow(_lag_voltage(record.voltage, lag / record.interval), rows[has_reading])
     design, which, coefficients = _with_creep(basis, creep, columns, among_columns)
     # A gain and a half is creep of 7% a decade: negative or larger creep is something else.
     slope = np.ptp(centered) / max(float(np.ptp(record.voltage)), 1e-300)
@@ -125,7 +125,7 @@ def fit_loop(record: Record) -> LoopFit:
 
     def curved(samples: float) -> float:
         """Return the sum of squares that a curve without loops leaves behind a lag."""
-        u = _lagged(record.voltage, samples)[rows[has_reading]]
+        u = _lag_voltage(record.voltage, samples)[rows[has_reading]]
         u = (u - u.mean()) / max(float(np.ptp(u)), 1e-300)
         curve = np.column_stack([np.ones(u.size), u, u**2, trend_shape])
         return _best_decay(curve, columns, among_columns)[0]
@@ -135,7 +135,7 @@ def fit_loop(record: Record) -> LoopFit:
     nearest = int(np.argmin([curved(lag) for lag in samples]))
     between = samples[max(nearest - 1, 0)], samples[min(nearest + 1, samples.size - 1)]
     optimum = scipy.optimize.minimize_scalar(curved, bounds=between, method="bounded")
-    (loops,) = _bases(_lagged(record.voltage, optimum.x)[np.newaxis, rows], has_reading)
+    (loops,) = _bases(_lag_voltage(record.voltage, optimum.x)[np.newaxis, rows], has_reading)
     basis_behind = np.column_stack([loops, trend_shape])
     behind_lag = _best_decay(basis_behind, columns, among_columns)[0]
     remainder = min(remainder, behind_lag)
@@ -228,7 +228,7 @@ def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:
     return np.unique(np.concatenate([[0], evenly, early, extremes]))
 
 
-def _lagged(voltage: FloatArray, samples: float) -> FloatArray:
+def _lag_voltage(voltage: FloatArray, samples: float) -> FloatArray:
     """Return the voltage behind a first-order lag that is settled at its start."""
     if samples == 0:
         return voltage
@@ -266,7 +266,7 @@ def _slow(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     decades + 4).
     """
     times = 10.0 ** np.arange(1.0, max(np.log10(voltage.size), 1.1))
-    decades = 0.05 * np.stack([_lagged(voltage, time)[rows] for time in times], axis=1)
+    decades = 0.05 * np.stack([_lag_voltage(voltage, time)[rows] for time in times], axis=1)
     half = max(float(np.ptp(voltage)) / 2, 1e-300)
     rates = np.array([1.0, 3.0])
     h = np.stack([np.zeros(2), 0.4 / (1.5 * rates)])

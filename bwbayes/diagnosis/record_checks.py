@@ -17,8 +17,8 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.loopfit import LONG_DECAY, LoopFit, find_delay, fit_loop
 from bwbayes.diagnosis.series_patterns import (
     FrozenRun,
-    clipped,
     copies,
+    find_clipped,
     find_held,
     find_repeated,
     lasting_jumps,
@@ -342,7 +342,7 @@ def _stuck(record: Record) -> Iterator[Finding]:
     limits: list[str] = []
     stays: list[tuple[float, float, str]] = []
     for side, sign in (("smallest", -1.0), ("largest", 1.0)):
-        ends = clipped(sign * displacement, voltage)
+        ends = find_clipped(sign * displacement, voltage)
         if ends is not None:
             limits.append(repr(float(f"{displacement[ends.first[0]]:.12g}")))
             start, stop = record.time[rows[[ends.first[0], ends.last[-1]]]].tolist()

@@ -153,7 +153,7 @@ class FrozenRun(NamedTuple):
         return int(np.median(self.last - self.first + 1))
 
 
-def clipped(values: FloatArray, other: FloatArray) -> FrozenRun | None:
+def find_clipped(values: FloatArray, other: FloatArray) -> FrozenRun | None:
     """Return the runs of values (samples,) at their largest while the other column moves on.
 
     A sensor whose steps are finer than its noise hardly ever repeats itself, in 2% of its

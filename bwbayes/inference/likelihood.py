@@ -257,7 +257,7 @@ class Likelihood:
         ``displacement`` is as in :meth:`score`.
         """
         if self.noise.tailed:
-            return self._followed(theta, displacement).log_density
+            return self._follow(theta, displacement).log_density
         return self.start(theta, displacement).log_density
 
     def start(self, theta: FloatArray, displacement: FloatArray | None = None) -> LinearStart:
@@ -273,7 +273,7 @@ class Likelihood:
         as in :meth:`score`.
         """
         if self.noise.tailed:
-            followed, states = self._followed(theta, displacement), self.noise.states
+            followed, states = self._follow(theta, displacement), self.noise.states
             scores = heavy_tails.normal_scores(self.spaced, self.table.noise(theta), followed)
             return LinearStart(
                 followed.log_density,
@@ -289,7 +289,7 @@ class Likelihood:
             from bwbayes.inference import compiled  # noqa: PLC0415
 
             products = compiled.products(self, theta, displacement)
-        return self._integrated(theta, *products)
+        return self._integrate_unknowns(theta, *products)
 
     def score(
         self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
@@ -309,17 +309,17 @@ class Likelihood:
         turn.
         """
         products, log_determinant = self.products_of_series(theta, shapes, displacement)
-        start, end = self._integrated(theta, products, log_determinant), 1 + self.unknowns
+        start, end = self._integrate_unknowns(theta, products, log_determinant), 1 + self.unknowns
         series = [0, *range(end, products.shape[1])]
         across = products[:, 1:end][:, :, series]
         explained = np.einsum("mui,muv,mvj->mij", across, start.covariance, across)
         unexplained = products[:, series][:, :, series] - explained
         if self.noise.tailed:
-            density = self._followed(theta, displacement).log_density
+            density = self._follow(theta, displacement).log_density
             return Score(unexplained[:, 1:, 0], unexplained[:, 1:, 1:], density)
         return Score(unexplained[:, 1:, 0], unexplained[:, 1:, 1:], start.log_density)
 
-    def _integrated(
+    def _integrate_unknowns(
         self, theta: FloatArray, products: FloatArray, log_determinant: FloatArray
     ) -> LinearStart:
         """Integrate the unknowns out of products (models, series, series) of whitened series.
@@ -331,7 +331,7 @@ class Likelihood:
         prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
         pull = sd * products[:, 1:end, 0]
         matrices = np.eye(end - 1) + prior * products[:, 1:end, 1:end]
-        mean, covariance, log_volume = _solved(matrices, pull)
+        mean, covariance, log_volume = _solve(matrices, pull)
         squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
         # Less cannot be told of a difference: where noise is next to none and an unknown without
         # bounds, what rounding left was a place more probable than any that is possible.
@@ -494,7 +494,7 @@ class Likelihood:
         skipped = self.readings.skipped
         return heavy_tails.follow(self.spaced, noise, series, start_sd, skipped, along)
 
-    def _followed(self, theta: FloatArray, displacement: FloatArray | None = None) -> Followed:
+    def _follow(self, theta: FloatArray, displacement: FloatArray | None = None) -> Followed:
         """Filter the readings at θ (models, parameters); ``displacement`` as in :meth:`score`."""
         nothing = np.empty((0, self.readings.rows.size))
         followed = [
@@ -504,7 +504,7 @@ class Likelihood:
         return Followed(*map(np.concatenate, zip(*followed, strict=True)))
 
 
-def _solved(matrices: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _solve(matrices: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Solve (1 + S) x = pull (models, size), S (models, size, size) not negative.
 
     Returns x, the inverses of 1 + S, and the logarithms of the determinants.
@@ -524,7 +524,7 @@ def _solved(matrices: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatAr
     # Eigenvalues that are rounding beside the largest are taken for the one that was lost.
     solution, inverse = np.empty_like(pull), np.empty_like(matrices)
     log_determinant = np.empty(len(matrices))
-    solution[~lost], inverse[~lost], log_determinant[~lost] = _solved(matrices[~lost], pull[~lost])
+    solution[~lost], inverse[~lost], log_determinant[~lost] = _solve(matrices[~lost], pull[~lost])
     values, vectors = np.linalg.eigh(matrices[lost])
     smallest = 4 * matrices.shape[1] * np.finfo(float).eps * values[:, -1:]
     values = np.where(values < np.maximum(smallest, 1.0), 1.0, values)

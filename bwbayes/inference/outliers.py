@@ -130,8 +130,8 @@ def surprise(
         backward[missing] = np.linalg.solve(stationary, forward[missing] @ stationary).T
     turned = np.concatenate([[0.0], readings.skipped[:0:-1]])
     of_states = stationary, observe
-    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *of_states, sensor)
-    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *of_states, sensor[::-1])
+    m_1, p_1 = _predict(residual, readings.skipped, fitted, forward, *of_states, sensor)
+    after = _predict(residual[::-1], turned, fitted[::-1], backward, *of_states, sensor[::-1])
     m_2, p_2 = after[0][::-1], after[1][::-1]
     inverse_1, inverse_2 = np.linalg.inv(p_1), np.linalg.inv(p_2)
     joined = np.linalg.inv(inverse_1 + inverse_2 - np.linalg.inv(stationary))
@@ -141,7 +141,7 @@ def surprise(
     return np.asarray(distance / np.sqrt(projected @ observe + sensor))
 
 
-def _predicted(
+def _predict(
     residual: FloatArray,
     skipped: FloatArray,
     fitted: BoolArray,

@@ -222,9 +222,9 @@ class JointPrior:
                     f"{parameter.name}: fixed at {parameter.fixed:g}; must hold: {stated}"
                 )
         if not np.all(self._possible(fixed)):
-            raise InputError(f"priors: fixed values must have {self._stated()}")
+            raise InputError(f"priors: fixed values must have {self._constraint_text()}")
 
-    def _stated(self) -> str:
+    def _constraint_text(self) -> str:
         """Return the physical constraints in words."""
         stated = (p.declared.stated_bounds for p in self.parameters)
         return " and ".join(filter(None, stated))
@@ -267,7 +267,7 @@ class JointPrior:
             accepted = np.concatenate([accepted, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if accepted.shape[0] < 1e-4 * tried - 10:
-                raise InputError(f"priors: hardly any draw has {self._stated()}")
+                raise InputError(f"priors: hardly any draw has {self._constraint_text()}")
         return accepted[:size]
 
     def unconstrain(self, free: FloatArray) -> FloatArray:
@@ -486,7 +486,7 @@ class ParameterTable:
         """Return the columns of one record's θ that the noise takes, (models, parameters)."""
         return theta[:, len(self.actuator_part.parameters) :]
 
-    def replaced(self, theta: FloatArray, name: str, values: FloatArray) -> FloatArray:
+    def with_values(self, theta: FloatArray, name: str, values: FloatArray) -> FloatArray:
         """Return a copy of θ (models, parameters) with other values (models,) of one parameter."""
         theta = theta.copy()
         theta[:, self.names.index(name)] = values

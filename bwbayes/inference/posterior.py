@@ -230,7 +230,7 @@ class Posterior:
             )
         return self.with_readings(displacements)
 
-    def trained(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:
+    def with_training(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:
         """Return the posterior of other training windows of the same records, by name."""
         datasets = (replace(dataset, training=windows[dataset.name]) for dataset in self.datasets)
         return replace(self, datasets=tuple(datasets))

@@ -51,7 +51,7 @@ def add_prior_creep(
     """
     if any(dataset.actuator.creep for dataset in posterior.datasets):
         return posterior, draws
-    extended, creep = _extended(posterior, duration)
+    extended, creep = _with_creep(posterior, duration)
     columns = dict(zip(posterior.names, draws.T, strict=True))
     columns |= {name: np.zeros(len(draws)) for name in creep.names}
     places = extended.prior.unconstrain(np.stack([columns[n] for n in extended.names], axis=1))
@@ -88,7 +88,7 @@ def add_prior_creep(
     return extended, longer
 
 
-def _extended(posterior: Posterior, duration: float) -> tuple[Posterior, Creep]:
+def _with_creep(posterior: Posterior, duration: float) -> tuple[Posterior, Creep]:
     """Return the posterior of the same records with creep, and the creep.
 
     It goes from what is as fast as the drives that were fitted to a plan's length.

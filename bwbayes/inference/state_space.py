@@ -380,7 +380,7 @@ class SumNoise(Noise):
         """Return that of the term that has heavy tails, if any."""
         degrees = [
             term.inverse_df(columns_of_term)
-            for term, columns_of_term in self._split(theta)
+            for term, columns_of_term in self._split_terms(theta)
             if term.tailed
         ]
         return degrees[0] if degrees else np.zeros(len(theta))
@@ -392,7 +392,7 @@ class SumNoise(Noise):
 
     def sensor_variance(self, theta: FloatArray, speed: FloatArray) -> FloatArray:
         """Return that of the term whose noise grows, if any."""
-        for term, columns_of_term in self._split(theta):
+        for term, columns_of_term in self._split_terms(theta):
             if term.paced:
                 return term.sensor_variance(columns_of_term, speed)
         return super().sensor_variance(theta, speed)
@@ -419,7 +419,7 @@ class SumNoise(Noise):
     def correlation_time(self, theta: FloatArray) -> FloatArray:
         """Return the mean of those of all terms, by their variances (models,), s."""
         times, variances = np.zeros(len(theta)), np.zeros(len(theta))
-        for term, columns_of_term in self._split(theta):
+        for term, columns_of_term in self._split_terms(theta):
             variance = term.marginal_sd(columns_of_term)[0] ** 2
             times += variance * term.correlation_time(columns_of_term)
             variances += variance
@@ -430,7 +430,7 @@ class SumNoise(Noise):
         terms = tuple(term.at(interval) for term in self.terms)
         return replace(self, interval=interval, terms=terms)
 
-    def _split(self, theta: FloatArray) -> Iterator[tuple[Noise, FloatArray]]:
+    def _split_terms(self, theta: FloatArray) -> Iterator[tuple[Noise, FloatArray]]:
         """Yield each term with its own parameters."""
         first = 1
         for term in self.terms:
@@ -442,7 +442,7 @@ class SumNoise(Noise):
         self, theta: FloatArray, block_of: Callable[[Noise, FloatArray], FloatArray]
     ) -> FloatArray:
         """Return matrices (..., states, states) with a block of each term along their diagonal."""
-        blocks = [block_of(*term) for term in self._split(theta)]
+        blocks = [block_of(*term) for term in self._split_terms(theta)]
         matrices = np.zeros((*blocks[0].shape[:-2], self.states, self.states))
         first = 0
         for block in blocks:

@@ -63,7 +63,7 @@ def beginning(posterior: Posterior, samples: int) -> Posterior:
         if dataset.readings.samples > max(last, 2 * samples):
             cut = (slice(w.start, min(w.stop, last)) for w in dataset.training if w.start < last)
             windows[dataset.name], shorter = tuple(cut), True
-    return posterior.trained(windows) if shorter else posterior
+    return posterior.with_training(windows) if shorter else posterior
 
 
 def thin(dataset: Likelihood, stride: int) -> Likelihood:

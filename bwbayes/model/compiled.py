@@ -99,7 +99,7 @@ register_model(FormulaType)(models.OpaqueModel)
 
 
 @unbox(FormulaType)  # type: ignore[no-untyped-call, untyped-decorator]
-def _unboxed(kind: Any, formula: Any, context: Any) -> Any:  # noqa: ARG001  # its type says all
+def _unbox(kind: Any, formula: Any, context: Any) -> Any:  # noqa: ARG001  # its type says all
     return NativeValue(context.context.get_dummy_value())  # type: ignore[no-untyped-call]
 
 
@@ -168,7 +168,7 @@ overload(look_up)(lambda rows, index: lambda rows, index: rows[np.intp(index)]) 
 
 
 @overload(gone, jit_options=cast("Any", INNER))
-def _gone(z: Any) -> Any:  # noqa: ARG001
+def _overload_gone(z: Any) -> Any:  # noqa: ARG001
     """Return 1 − exp(−z) without a call, so that a compiler makes vectors of it.
 
     exp(−z) is 2⁻ᵏ exp(r) with k whole, whose bits are put where a number's exponent is.

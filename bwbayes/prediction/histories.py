@@ -234,7 +234,7 @@ class States:
         before, after = self.quantiles[node], self.quantiles[node + 1]
         lower, upper = self.ordered[node, rows], self.ordered[node + 1, rows]
         state = lower + (quantile - before) / (after - before) * (upper - lower)
-        return self.table.replaced(self.theta, "initial", state)
+        return self.table.with_values(self.theta, "initial", state)
 
 
 def choose_histories(
@@ -289,7 +289,7 @@ def choose_together(
     states = [States(likelihood, theta, TRIES) for likelihood in likelihoods]
     every = np.arange(draws * TRIES)
 
-    def started(scores: FloatArray) -> tuple[IntArray, FloatArray]:
+    def draw_histories(scores: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return histories and θ of normal scores (tries, 2 + unknowns)."""
         # Farther out a probability is one to rounding, and its quantile infinite.
         history, quantile, *others = scipy.special.ndtr(np.clip(scores.T, -8.0, 8.0))
@@ -300,7 +300,7 @@ def choose_together(
         return which, start_theta
 
     def density(scores: FloatArray) -> FloatArray:
-        which, start_theta = started(scores)
+        which, start_theta = draw_histories(scores)
         (values,) = Histories(likelihoods, which).each(
             start_theta, lambda likelihood, rows: (likelihood.log_density(rows),)
         )
@@ -335,7 +335,7 @@ def choose_together(
             taken = np.log(generator.uniform(size=len(every))) < gain
             scores[taken], log[taken] = moved[taken], log_moved[taken]
         watch(power)
-    which, start_theta = started(scores)
+    which, start_theta = draw_histories(scores)
     # Any of a draw's tries.
     rows = TRIES * np.arange(draws) + generator.integers(TRIES, size=draws)
     return Histories(likelihoods, which[rows]), start_theta[rows], evidence

@@ -210,7 +210,7 @@ def estimate_initial_states(
     if estimate_offset:
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
-        theta = likelihood.table.replaced(theta, "offset", level)
+        theta = likelihood.table.with_values(theta, "offset", level)
     elif len(ranges) > 1:
         # The mean is in the domain, which is convex; a median of each parameter need not be.
         typical = likelihood.table.actuator(np.mean(theta, axis=0)[np.newaxis])
@@ -228,7 +228,7 @@ def estimate_initial_states(
     rows = resample(evidence, generator)
     theta, start_theta = theta[rows], start_theta[rows]
     histories = replace(histories, which=histories.which[rows])
-    informed = _informed(histories, start_theta, record, window, generator)
+    informed = _estimate_from_lead_in(histories, start_theta, record, window, generator)
     informed = replace(informed, rows=rows)
     if not start.after:
         return informed
@@ -249,7 +249,7 @@ def _of_new_record(
         if name in ("initial", "offset") or declared.scope == "actuator":
             continue
         if stands is not None:
-            theta = alone.table.replaced(theta, name, np.full(len(theta), stands))
+            theta = alone.table.with_values(theta, name, np.full(len(theta), stands))
         elif parameter.fixed is None:
             unknowns.append(partial(_put_left, alone, parameter))
     return theta, unknowns
@@ -265,7 +265,7 @@ def _put_left(
         if left is None
         else left(alone.table.columns(theta), alone.extent, probability)
     )
-    return alone.table.replaced(theta, parameter.name, value)
+    return alone.table.with_values(theta, parameter.name, value)
 
 
 def _after(likelihood: Likelihood, span: Span) -> Likelihood:
@@ -369,7 +369,7 @@ def _unseen(
     return start
 
 
-def _informed(
+def _estimate_from_lead_in(
     histories: Histories,
     theta: FloatArray,
     record: Record,
@@ -389,7 +389,7 @@ def _informed(
         shift = np.einsum("mij,mi->mj", pull, initial_transient - mean[:, 1:])[:, 0]
         variance = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
         level = likelihood.table.columns(theta)["offset"] + mean[:, 0] + shift
-        start_theta = likelihood.table.replaced(theta, "offset", level)
+        start_theta = likelihood.table.with_values(theta, "offset", level)
         sd = np.sqrt(np.maximum(variance, 0.0))
     lead_in = LeadIn(
         float(record.time[window.start]),

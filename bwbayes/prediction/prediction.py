@@ -170,7 +170,7 @@ def forecast(
     planned = np.asarray(voltage, dtype=np.float64)
     if planned.ndim != 1 or planned.size == 0 or not np.isfinite(planned).all():
         raise InputError(f"{name}: voltage of shape {planned.shape}; give one finite row, in V")
-    longer = continued(record, planned)
+    longer = continue_record(record, planned)
     after = slice(record.samples, longer.samples)
     theta = posterior.prior.theta(draws)
     start_states = training_initial_states(posterior, theta, generator)
@@ -184,7 +184,7 @@ def forecast(
     return replace(bands, model_error_sd=model_error_sd)
 
 
-def continued(record: Record, voltage: FloatArray) -> Record:
+def continue_record(record: Record, voltage: FloatArray) -> Record:
     """Return a record as it goes on into a planned voltage (samples,), V, without readings.
 
     Its covariates are unknown from there on.
@@ -322,7 +322,7 @@ def _bands(
                 variances = [*variances]
                 variances[2] = noise.sensor_variance(parameters, speed[first:end])
             work = executor.submit(
-                _summarized, start, variances, scores, tails, sensor, record, first, inside
+                _summarize, start, variances, scores, tails, sensor, record, first, inside
             )
             pending.append((first - window.start, work))
             totals += inside.sum(axis=1)
@@ -352,7 +352,7 @@ def _bands(
     )
 
 
-def _summarized(
+def _summarize(
     start: InitialStates,
     variances: Sequence[FloatArray],
     scores: FloatArray,

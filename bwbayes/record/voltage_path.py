@@ -186,7 +186,7 @@ def _fit_path(voltage: FloatArray, noise_sd: float) -> tuple[FloatArray, int, fl
     extrema, first_is_top = _real_reversals(fits, sqrt(2 * log(voltage.size)) * sd)
     weights = 1 / sd**2
     path = _monotone(fits, extrema, first_is_top, weights)
-    path = _leveled(voltage, path, noise_sd, agreeing_sd, extrema, first_is_top)
+    path = _level_extremes(voltage, path, noise_sd, agreeing_sd, extrema, first_is_top)
     path = _monotone(path, extrema, first_is_top, weights)
     return path, extrema.size, float(2 * np.sum(agreeing_sd[extrema]))
 
@@ -289,7 +289,7 @@ def _monotone(
     return result
 
 
-def _leveled(
+def _level_extremes(
     voltage: FloatArray,
     path: FloatArray,
     noise_sd: float,

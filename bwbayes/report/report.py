@@ -226,8 +226,8 @@ class Report:
             "title": self.quantities.say(self.title),
             "heading": self.quantities.say(self.heading),
             "about": self.quantities.say(self.about),
-            "banners": [_said(banner, self.quantities) for banner in self.banners],
-            "blocks": [_said(block, self.quantities) for block in self.blocks],
+            "banners": [_translate(banner, self.quantities) for banner in self.banners],
+            "blocks": [_translate(block, self.quantities) for block in self.blocks],
             "numbers": self.quantities.rendered(self.numbers),
             "csv": f"{heading}{newline}{rows}",
         }
@@ -238,19 +238,19 @@ class Report:
         yield from _flat(self.blocks)
 
 
-def _said(part: Any, quantities: Quantities) -> Any:
+def _translate(part: Any, quantities: Quantities) -> Any:
     """Return a part of a report in the words of quantities; names are for links and files."""
     if isinstance(part, str):
         return quantities.say(part)
     if isinstance(part, list | tuple):
-        return [_said(item, quantities) for item in part]
+        return [_translate(item, quantities) for item in part]
     if isinstance(part, Mapping):
-        return {quantities.heading(key): _said(item, quantities) for key, item in part.items()}
+        return {quantities.heading(key): _translate(item, quantities) for key, item in part.items()}
     if not is_dataclass(part) or isinstance(part, type):
         return part
     kept = ("name", "kind", "on")
     changes = {
-        each.name: _said(getattr(part, each.name), quantities)
+        each.name: _translate(getattr(part, each.name), quantities)
         for each in fields(part)
         if each.name not in kept
     }

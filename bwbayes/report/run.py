@@ -159,7 +159,7 @@ def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:
         "bad",
         "NOT CONVERGED",
         blocks=[
-            Text(f"Stopped: {result.outcome.stop_reason}. {_sampled(result)}"),
+            Text(f"Stopped: {result.outcome.stop_reason}. {_chain_facts(result)}"),
             Text(
                 "The chain has not converged, so no parameter or displacement intervals are shown. "
                 "Fix:"
@@ -179,7 +179,7 @@ def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:
     )
 
 
-def _sampled(result: Result) -> str:
+def _chain_facts(result: Result) -> str:
     check = result.outcome.check
     return f"{check.steps} steps, {100 * check.acceptance:.0f}% of the moves accepted."
 
@@ -206,7 +206,7 @@ def _results(result: Result) -> list[Text]:
         )
     if not texts:
         texts.append(Markup("There are no readings to check the bands against."))
-    sampling = Markup("Sampling: {}. {}").format(result.outcome.stop_reason, _sampled(result))
+    sampling = Markup("Sampling: {}. {}").format(result.outcome.stop_reason, _chain_facts(result))
     if result.remarks:
         link = Markup(' <a href="#remarks">Remarks: {}</a>.')
         sampling += link.format(len(result.remarks))
@@ -571,7 +571,7 @@ def loops_table(loops: Loops) -> Table:
             "they were."
         )
     records = flat_records({"major": loops.major.numbers, "minor": loops.minor.numbers})
-    return _measured("loops", "Measured loops", MEASURES, estimates, records, note)
+    return _table_of("loops", "Measured loops", MEASURES, estimates, records, note)
 
 
 def steps_table(steps: Mapping[str, StepResponse]) -> Table:
@@ -587,10 +587,10 @@ def steps_table(steps: Mapping[str, StepResponse]) -> Table:
         "the step, of the displacement at 0.1 s, a decade of time."
     )
     records = flat_records({name: response.numbers for name, response in steps.items()})
-    return _measured("steps", "Measured step responses", STEP_MEASURES, estimates, records, note)
+    return _table_of("steps", "Measured step responses", STEP_MEASURES, estimates, records, note)
 
 
-def _measured(
+def _table_of(
     name: str,
     caption: str,
     measures: Mapping[str, tuple[str, str]],

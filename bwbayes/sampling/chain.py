@@ -179,11 +179,11 @@ class Chain:
 
         The draws are those of the first ``blocks`` blocks that count, or of all.
         """
-        return self._joined(phase, "coordinates", thin, blocks)
+        return self._join(phase, "coordinates", thin, blocks)
 
     def log_density(self, phase: Phase, thin: int = 1, blocks: int | None = None) -> FloatArray:
         """Return the log density (steps, ensembles, walkers), nats, of :meth:`coordinates`."""
-        return self._joined(phase, "log_density", thin, blocks)
+        return self._join(phase, "log_density", thin, blocks)
 
     def accepted(self, phase: Phase) -> IntArray:
         """Return the accepted moves of each block, (blocks, ensembles, walkers)."""
@@ -206,7 +206,7 @@ class Chain:
         """Return the blocks that count."""
         return self._blocks[phase][self.set_aside if phase == "sampling" else 0 :]
 
-    def _joined(self, phase: Phase, name: str, thin: int, count: int | None) -> FloatArray:
+    def _join(self, phase: Phase, name: str, thin: int, count: int | None) -> FloatArray:
         parts, done = [], 0
         for blocks in self._counting(phase)[:count]:
             arrays = [getattr(block, name) for block in blocks]
@@ -341,7 +341,7 @@ class ChainFile(Chain):
         chain: ChainFile | None = None
         try:
             load = partial(_load, path)
-            chain = cls._begun(path, load("start"))
+            chain = cls._read_start(path, load("start"))
             chain._read_blocks(load)
         except Exception as error:  # a damaged file may raise any exception
             damage = one_line(str(error)) or type(error).__name__
@@ -461,7 +461,7 @@ class ChainFile(Chain):
             raise _not_written(file, error) from None
 
     @classmethod
-    def _begun(cls, path: Path, arrays: Arrays | None) -> ChainFile:
+    def _read_start(cls, path: Path, arrays: Arrays | None) -> ChainFile:
         """Return the chain of a folder without its blocks."""
         if arrays is None:
             raise LookupError("it has no start")

@@ -131,7 +131,7 @@ class _Sampling:
             self._extend("pilot")
         if not chain.history("sampling"):
             self._tune()
-        while (outcome := self._sampled()) is None:
+        while (outcome := self._sample_or_fall_back()) is None:
             history, proposal = chain.history("sampling"), None
             if self._is_early:
                 # Fit to all blocks of the sampling, whether they count or not.
@@ -141,7 +141,7 @@ class _Sampling:
                     fitted_to.append("sampling", blocks)
                 thin = thinning(fitted_to.draws("sampling"))
                 before = chain.proposal_in_use("sampling")
-                proposal = self._fitted(fitted_to, "sampling", slice(None), thin, before)
+                proposal = self._fit_proposal(fitted_to, "sampling", slice(None), thin, before)
             chain.fall_back(len(history), proposal)
         return replace(outcome, remarks=_remarks(chain))
 
@@ -200,7 +200,7 @@ class _Sampling:
         run that resumes within a round repeats the fit with which that round began.
         """
         plan, chain = self.plan, self.chain
-        proposal = self._fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
+        proposal = self._fit_proposal(chain, "pilot", slice(chain.steps("pilot") // 2, None))
         begin, end, rate = 0, 1, 0.0
         while rate < 0.5 and end <= 4:
             if chain.blocks("tuning") < end:
@@ -208,12 +208,12 @@ class _Sampling:
             while chain.blocks("tuning") < end:
                 self._extend("tuning")
             now = slice(begin * plan.block, end * plan.block)
-            proposal = self._fitted(chain, "tuning", now, before=chain.proposals["tuning"])
-            rate = _accepted(chain.history("tuning")[begin:end], "mixture")
+            proposal = self._fit_proposal(chain, "tuning", now, before=chain.proposals["tuning"])
+            rate = _acceptance_rate(chain.history("tuning")[begin:end], "mixture")
             begin, end = end, 2 * end
         chain.freeze("sampling", proposal)
 
-    def _fitted(
+    def _fit_proposal(
         self,
         chain: Chain,
         phase: Phase,
@@ -230,7 +230,7 @@ class _Sampling:
         log_density = chain.log_density(phase, thin)[steps].ravel()
         flat, guess = draws.reshape(-1, draws.shape[-1]), chain.proposals["pilot"]
         made = chain.history(phase)[-(-steps.start // self.plan.block) if steps.start else 0 :]
-        lags = _accepted(made, "mixture") < _accepted(made, "differential evolution")
+        lags = _acceptance_rate(made, "mixture") < _acceptance_rate(made, "differential evolution")
         try:
             if before and guess and linear(self.posterior) and (before.has_secant or lags):
                 place = flat[np.argmax(log_density)]
@@ -239,7 +239,7 @@ class _Sampling:
         except np.linalg.LinAlgError:
             return None
 
-    def _sampled(self) -> SamplingResult | None:
+    def _sample_or_fall_back(self) -> SamplingResult | None:
         """Sample to the end, or until the proposal turns out not to cover the draws: then None.
 
         A chain that already has blocks is checked at the lengths at which a new one would be.
@@ -358,7 +358,7 @@ def _agree(draws: FloatArray) -> bool:
     return bool((nested_rhat(draws) < 1.1).all())
 
 
-def _accepted(history: Sequence[Sequence[Block]], move: str) -> float:
+def _acceptance_rate(history: Sequence[Sequence[Block]], move: str) -> float:
     """Return the acceptance rate of a move in blocks; 1 without proposals."""
     counts = [block.moves.get(move, (0, 0)) for blocks in history for block in blocks]
     proposed, accepted = np.sum(counts, axis=0) if counts else (0, 0)

@@ -110,7 +110,7 @@ def test_a_records_run_is_what_the_run_command_makes(
     """But for a search for stages: all records of a campaign have the same model."""
     file = given / "records/s000.csv"
     text = CONFIG.replace("[record]", f'[record]\nfile = "{file}"')
-    config = parse(text, "alone").searched("none")
+    config = parse(text, "alone").with_search("none")
     alone = resume_run(
         RunFolder.create(tmp_path / "alone", resolve_config(config, given)),
         small.quiet(),

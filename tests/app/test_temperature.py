@@ -25,7 +25,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
-from bwbayes.control.exported import exported
+from bwbayes.control.exported import export_model
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.study import InitialConditions
@@ -197,7 +197,9 @@ def test_a_model_at_a_temperature_is_exported(tmp_path: Path) -> None:
     stages, conditions = (Temperature(), TemperatureOffset()), {"temperature_degC": 31.0}
     plain = replace(cases.actuator("bouc-wen, second-order", "zero"), stages=stages)
     voltage, theta = cases.drive(500), cases.theta(plain)
-    made = exported("bender", replace(plain, conditions=conditions), theta[0], Limits(*cases.SPAN))
+    made = export_model(
+        "bender", replace(plain, conditions=conditions), theta[0], Limits(*cases.SPAN)
+    )
     compiled = Compiled(made, tmp_path, needs("cc"))
     assert "It is the model at temperature_degC = 31.0." in made.c_code()
     seen = {"temperature_degC": np.full(voltage.size + 1, 31.0)}

@@ -105,7 +105,7 @@ def test_replicate_with_too_few_draws_is_not_ranked() -> None:
 def around() -> CalibrationSetup:
     """Return an experiment around the posterior of the first replicate's record."""
     posterior = replace(small().posterior, engine=resolve_engine())
-    _, records = module._simulated(small(), np.random.default_rng(1))
+    _, records = module._simulate_truth(small(), np.random.default_rng(1))
     reading = records["record"].record.displacement
     assert reading is not None
     posterior = posterior.with_readings({"record": reading})
@@ -181,7 +181,7 @@ def test_draws_that_are_too_narrow_are_noticed_by_more_replicates(around: Calibr
 def test_readings_of_both_enter(around: CalibrationSetup) -> None:
     """The log density of both together is the sum, less a prior."""
     posterior = around.posterior
-    _, records = module._simulated(around, np.random.default_rng(9))
+    _, records = module._simulate_truth(around, np.random.default_rng(9))
     reading = records["record"].record.displacement
     assert reading is not None
     replicated = posterior.with_readings({"record": reading})
@@ -226,7 +226,7 @@ def test_one_discrepancy_goes_through_all_training_windows() -> None:
     experiment = CalibrationSetup(posterior, PLAN)
     away = []
     for seed in range(200):
-        theta, records = module._simulated(experiment, np.random.default_rng(seed))
+        theta, records = module._simulate_truth(experiment, np.random.default_rng(seed))
         made = records["record"]
         assert made.record.truth is not None
         away.append((made.record.truth - made.model) / theta["discrepancy_sd"])

@@ -110,7 +110,7 @@ def kept(known: tuple[Posterior, FloatArray], voltage: FloatArray, seed: int) ->
     # The new record has a start and an offset of its own.
     new = prior.theta(prior.draw(source, 1))
     for name in ("initial", "offset"):
-        truth = table.replaced(truth, name, table.columns(new)[name])
+        truth = table.with_values(truth, name, table.columns(new)[name])
     clean = posterior.likelihood.actuator.displacement(table.actuator(truth), voltage)[0]
     discrepancy, sensor = posterior.single_record.noise.draw(
         table.noise(truth), voltage.size, source

@@ -17,7 +17,7 @@ from hypothesis import given, strategies as st
 from scipy.signal import StateSpace, dlsim
 
 from bwbayes.arrays import FloatArray, anywhere, look_up, select
-from bwbayes.control.exported import MATH_H, Exported, c_functions, exported, to_ascii
+from bwbayes.control.exported import MATH_H, Exported, c_functions, export_model, to_ascii
 from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
@@ -34,7 +34,7 @@ every_hold = pytest.mark.parametrize("hold", cases.HOLDS)
 
 def of(name: str, hold: Hold, limits: Limits | None = None) -> Exported:
     actuator = cases.actuator(name, hold)
-    return exported(
+    return export_model(
         name, actuator, cases.theta(actuator, 1, name)[0], limits or Limits(*cases.SPAN)
     )
 
@@ -139,7 +139,7 @@ def test_a_model_without_an_inverse_says_why_in_its_file(tmp_path: Path) -> None
     actuator = Actuator("none")
     theta = cases.theta(actuator)[0]
     theta[actuator.parameters.index("d")] = 0.4
-    made = exported("turns */ back", actuator, theta, Limits(*cases.SPAN))
+    made = export_model("turns */ back", actuator, theta, Limits(*cases.SPAN))
     code = made.c_code()
     assert "There is no inverse:\n * inverse: the model_s slope may be as low as" in code
     assert "actuator_inverse" not in code
@@ -280,7 +280,7 @@ class Signed(ReversedSign):
 
 def test_a_refused_formula_leaves_no_files(tmp_path: Path) -> None:
     made = replace(cases.actuator("bouc-wen"), stages=(Signed(),))
-    model = exported("signed", made, cases.theta(made)[0], Limits(*cases.SPAN))
+    model = export_model("signed", made, cases.theta(made)[0], Limits(*cases.SPAN))
     with pytest.raises(
         InputError, match=r"^Signed.move: `np.sign\(value\)` has no counterpart in C here; "
     ):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
+from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited_note
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
@@ -60,7 +60,7 @@ def test_what_a_drive_excites_that_the_record_did_not_is_said_in_a_word() -> Non
         ),
         (sine(0.1, 0.05), ""),
     ):
-        assert unexcited(beyond_training(SLOW, Inputs(voltage, interval=0.05))) == text
+        assert unexcited_note(beyond_training(SLOW, Inputs(voltage, interval=0.05))) == text
 
 
 def test_range_and_speed_are_said_one_by_one() -> None:

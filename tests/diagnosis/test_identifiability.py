@@ -14,7 +14,7 @@ from bwbayes.diagnosis.identifiability import (
     InformationGain,
     information_gain,
     spectrum,
-    undetermined,
+    undetermined_directions,
 )
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
@@ -61,7 +61,7 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
     amplitude: float, frequency: float, discrepancy: Discrepancy
 ) -> None:
     posterior = measured(sines(amplitude, frequency), discrepancy)
-    (finding,) = undetermined(posterior, at_truth(posterior))
+    (finding,) = undetermined_directions(posterior, at_truth(posterior))
     assert finding.text.startswith("gamma")
     assert "% of the effective prior's SD remains if the model is off by 1%" in finding.text
     assert "(next alpha" in finding.text
@@ -73,7 +73,7 @@ def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
     fixed = {"gamma": 0.0, "initial": 0.0, "mass": 0.00134, "stiffness": 4.1e5}
     record = measured(sines(10.0, 1.0, 3.0), rate=250.0).single_record
     small = posterior_of(record.voltage, record.displacement, record.actuator, "discrepancy", fixed)
-    (finding,) = undetermined(small, at_truth(small))
+    (finding,) = undetermined_directions(small, at_truth(small))
     assert finding.text.startswith("alpha with d against beta: ")
     assert finding.fix == "drive over more than 20 V peak to peak, if the actuator allows it"
 
@@ -81,7 +81,7 @@ def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
 @pytest.mark.parametrize("discrepancy", ["none", "structural"])
 def test_decaying_amplitudes_leave_nothing_open(discrepancy: Discrepancy) -> None:
     posterior = measured(signal("identification"), discrepancy)
-    assert [] == [*undetermined(posterior, at_truth(posterior))]
+    assert [] == [*undetermined_directions(posterior, at_truth(posterior))]
 
 
 @pytest.mark.parametrize("sigma", [0.003, 0.03])

@@ -196,7 +196,7 @@ def test_no_absurd_place_is_more_probable_than_a_possible_one(
     absurd |= {"sensor_sd": sensor, "discrepancy_sd": discrepancy}
     theta = usual[:1]
     for name, value in absurd.items():
-        theta = likelihood.table.replaced(theta, name, np.array([value]))
+        theta = likelihood.table.with_values(theta, name, np.array([value]))
     assert likelihood.log_density(theta)[0] < np.max(likelihood.log_density(usual))
 
 

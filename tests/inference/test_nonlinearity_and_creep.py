@@ -138,7 +138,7 @@ def unevenness(likelihood: Likelihood, theta: FloatArray) -> float:
     strengths = np.linspace(-0.004, 0.004, 10)  # none is zero, which stands for no creep
     along = np.repeat(theta, strengths.size, axis=0)
     for name in CREEP.names:
-        along = likelihood.table.replaced(along, name, strengths)
+        along = likelihood.table.with_values(along, name, strengths)
     bends = np.diff(likelihood.log_density(along), 2)
     return float(np.ptp(bends) / np.abs(np.mean(bends)))
 

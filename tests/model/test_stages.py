@@ -17,7 +17,7 @@ import scipy
 from hypothesis import given, settings, strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.exported import exported
+from bwbayes.control.exported import export_model
 from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.inference.compiled.walk import walk
@@ -351,7 +351,7 @@ def test_a_controller_and_its_c_file_do_the_same_and_undo_a_stage(
     size = np.ptp(expected)
     sampled = np.array(moved) + model.zero[0]
     np.testing.assert_allclose(sampled, expected, rtol=0, atol=1e-11 * size)
-    compiled = Compiled(exported("chain", made, row[0], Limits(*SPAN)), tmp_path, needs("cc"))
+    compiled = Compiled(export_model("chain", made, row[0], Limits(*SPAN)), tmp_path, needs("cc"))
     displacement = compiled.run("forward", voltage[0], voltage)
     np.testing.assert_allclose(displacement, moved, rtol=0, atol=1e-11 * size)
     if names == COMMANDED:
@@ -516,7 +516,7 @@ def test_a_stage_without_undo_is_refused_in_one_line_where_a_command_is_asked_fo
     with pytest.raises(InputError, match="inverse: no command undoes the stage saturation; leave"):
         inverse(made, models, made.displacement(models, drive(50)))
     assert "no command undoes" in str(
-        exported("one way", made, models[0], Limits(*SPAN)).without_inverse
+        export_model("one way", made, models[0], Limits(*SPAN)).without_inverse
     )
 
 

@@ -178,7 +178,7 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     logs = []
     for one in every:
         theta = np.repeat(draws[:1], states.size, axis=0)
-        logs.append(one.log_density(one.table.replaced(theta, "initial", states)))
+        logs.append(one.log_density(one.table.with_values(theta, "initial", states)))
     beforehand = np.array([0.45, 0.1, 0.45])
     weight = beforehand * np.mean(np.exp(np.array(logs) - np.max(logs)), axis=1)
     expected = weight / np.sum(weight)

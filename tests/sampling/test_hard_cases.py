@@ -125,7 +125,7 @@ def test_far_modes_converge_to_their_weights() -> None:
 
 def test_far_modes_do_not_converge_without_a_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
     """Differential evolution alone never changes between them: walkers stay where the pilot was."""
-    monkeypatch.setattr(sampler._Sampling, "_fitted", lambda *_, **__: None)
+    monkeypatch.setattr(sampler._Sampling, "_fit_proposal", lambda *_, **__: None)
     chain, outcome = run(PLAN, 2, target(two_far_modes, 2), MODES)
     assert not outcome.converged
     upper = chain.coordinates("sampling")[..., 0] > 0

@@ -64,7 +64,7 @@ def init(record: Path, *, reading: Reading, out: Path | None) -> int:
     out = out or record.with_suffix(".toml")
     if out.exists():
         raise InputError(f"{out}: exists; edit it, or choose another name with --out")
-    proposal = _proposed(record, out.parent, reading)
+    proposal = _propose_config(record, out.parent, reading)
     with refuse_unwritable(out, "choose another place with --out"):
         out.write_text(proposal.text, encoding="utf-8")
     _show(proposal, f"wrote {out}; next: `bwbayes check {out}`, then `bwbayes run {out}`")
@@ -95,7 +95,7 @@ def check(
     bwbayes check runs/measured_stack.toml --record my_record.csv
     """
     chosen, in_memory = _config_or_proposal(config, record, reading, "check", quiet=True)
-    chosen = chosen.searched(search)
+    chosen = chosen.with_search(search)
     out = out or Path("results") / f"{config.stem}-check"
     with working() as watch:
         from bwbayes.app.jobs.check import check as check_config
@@ -145,9 +145,9 @@ def run(
             from bwbayes.report.run import priors_table
 
         chosen, in_memory = _config_or_proposal(config, record, reading, "run", quiet=quiet)
-        chosen = chosen.renamed(path_text(config.stem), seed)
+        chosen = chosen.with_name(path_text(config.stem), seed)
         path = out or Path("results") / config.stem
-        chosen = chosen.searched(search)
+        chosen = chosen.with_search(search)
         with working():
             resolved = resolve_config(chosen, config.parent, in_memory)
             folder = RunFolder.create(path, resolved, overwrite)
@@ -212,7 +212,7 @@ def _config_or_proposal(
         refuse_beside_config(path, reading)
         return config if record is None else config.with_record(record), {}
     try:
-        proposal = _proposed(path, path.parent, reading)
+        proposal = _propose_config(path, path.parent, reading)
     except NoNumbersError:
         raise InputError(
             f"{path}: is no config, and no record; a config has a table [record], a record columns "
@@ -243,7 +243,7 @@ def _config_or_proposal(
     return config, {ALONE: proposal.record}
 
 
-def _proposed(path: Path, where: Path, reading: Reading) -> ConfigProposal:
+def _propose_config(path: Path, where: Path, reading: Reading) -> ConfigProposal:
     """Propose a config; of unknown columns say the command that settles them."""
     try:
         with working():
@@ -404,7 +404,7 @@ def calibrate(
         if config is None:
             folder = CalibrationFolder.open(Path(str(resumed)))
         else:
-            chosen = load(config).renamed(config.stem, seed)
+            chosen = load(config).with_name(config.stem, seed)
             path = out or Path("results") / f"{config.stem}-calibration"
             with working():
                 folder = start(chosen, config.parent, path, replicates, overwrite=overwrite)

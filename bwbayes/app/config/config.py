@@ -508,12 +508,12 @@ class Config(ConfigTable):
         source = self.record.model_copy(update=changes)
         return self.model_copy(update={"record": source})
 
-    def renamed(self, name: str, seed: int | None) -> Config:
+    def with_name(self, name: str, seed: int | None) -> Config:
         """Return the config with a name, if it has none, and another seed, if there is one."""
         changes = {"name": self.name or name} | ({} if seed is None else {"seed": seed})
         return self.model_copy(update=changes)
 
-    def searched(self, search: str | None) -> Config:
+    def with_search(self, search: str | None) -> Config:
         """Return the config with another longest time of the search for stages, if there is one.
 
         Raises InputError: it is no time.

@@ -132,7 +132,7 @@ def _text(
     source = _source(path, where, naming, record)
     dynamics = '"none"  # the record has no time'
     if record.quantities.has_clock:
-        others = ", ".join(_quoted(name) for name in DYNAMICS if name != "lag")
+        others = ", ".join(_quote(name) for name in DYNAMICS if name != "lag")
         dynamics = f'"lag"  # or {others}'
     command = ""
     if naming.units.get("voltage") is None and record.voltage_is == "output":
@@ -176,7 +176,7 @@ dynamics = {dynamics}
 """
 
 
-def _quoted(text: Any) -> str:
+def _quote(text: Any) -> str:
     # A JSON string is a TOML string too, except for DEL, which no column's name has.
     return json.dumps(text, ensure_ascii=False)
 
@@ -186,14 +186,14 @@ def _source(path: Path, where: Path, naming: Naming, record: Record) -> str:
 
     def relative(file: Path) -> str:
         location = Path(os.path.relpath(file.absolute(), where.absolute()))
-        return _quoted(path_text(location.as_posix()))
+        return _quote(path_text(location.as_posix()))
 
     source = f"file = {relative(path)}"
     if naming.displacement_file is not None:
         source += f"\ndisplacement_file = {relative(naming.displacement_file)}"
     for key, quantity in ("input", naming.input), ("output", naming.output):
-        source += "" if quantity is None else f"\n{key} = {_quoted(quantity)}"
-    source += "" if naming.linearity is None else f"\nlinearity = {_quoted(naming.linearity)}"
+        source += "" if quantity is None else f"\n{key} = {_quote(quantity)}"
+    source += "" if naming.linearity is None else f"\nlinearity = {_quote(naming.linearity)}"
     roles = {"voltage": "input", "displacement": "output"}
     names = {} if record.quantities.are_default else roles
     tables = {"columns": naming.columns, "units": naming.stated_units}
@@ -201,12 +201,12 @@ def _source(path: Path, where: Path, naming: Naming, record: Record) -> str:
     for key, table in tables.items():
         if table:
             pairs = ", ".join(
-                f"{names.get(name, name)} = {_quoted(column)}" for name, column in table.items()
+                f"{names.get(name, name)} = {_quote(column)}" for name, column in table.items()
             )
             source += f"\n{key} = {{ {pairs} }}"
     if naming.fs is not None and record.quantities.has_clock:
         source += f"\nfs = {naming.fs!r}"
-    return source + ("" if naming.table is None else f"\ntable = {_quoted(naming.table)}")
+    return source + ("" if naming.table is None else f"\ntable = {_quote(naming.table)}")
 
 
 def _heading(record: Record) -> str:

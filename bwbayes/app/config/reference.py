@@ -71,7 +71,7 @@ def config_reference(requested: str | None) -> str:
         first = {key.table: key.path for key in reversed(documented)}
         repeated = tuple(f"{k.path}." for k in documented if k.table and first[k.table] != k.path)
         shown = [key for key in documented if not key.path.startswith(repeated)]
-        return "\n\n".join([_wrapped(head), *map(_entry, shown)])
+        return "\n\n".join([_wrap(head), *map(_entry, shown)])
     path = requested.split(".")
     matches = [key for key in documented if _ends_with(key, path)]
     if not matches:
@@ -98,15 +98,15 @@ def _entry(key: Key) -> str:
     unit = f" ({key.unit})" if key.unit else ""
     default = {"none": "", "required": "; required"}.get(key.default, f"; default: {key.default}")
     title = f"[{key.path}]" if holds_keys else f"{key.path}: {key.kind}{unit}{default}"
-    lines = [title, _wrapped(key.description, "    ")]
+    lines = [title, _wrap(key.description, "    ")]
     if key.name in CHOICES and not holds_keys:
-        lines.append(_wrapped(f"Choices: {', '.join(CHOICES[key.name])}.", "    "))
+        lines.append(_wrap(f"Choices: {', '.join(CHOICES[key.name])}.", "    "))
     if key.example:
-        lines.append(_wrapped(f"Example: {key.name} = {key.example}", "    "))
+        lines.append(_wrap(f"Example: {key.name} = {key.example}", "    "))
     return "\n".join(lines)
 
 
-def _wrapped(text: str, indent: str = "") -> str:
+def _wrap(text: str, indent: str = "") -> str:
     return textwrap.fill(
         text, 96, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
     )
@@ -147,7 +147,7 @@ def parts_reference(requested: str | None) -> str:
             lines.append(f"  {name:25}{' '.join(summary.split())}")
         lines.append("")
     lines.append(
-        _wrapped(
+        _wrap(
             "`bwbayes models NAME` shows one: its equation, parameters, default priors and source. "
             "A part from outside the package goes by its import path, module:Class."
         )
@@ -174,7 +174,7 @@ def _part(kind: str, name: str, component: Any) -> str:
     if declared:
         lines += [
             "",
-            _wrapped(
+            _wrap(
                 "Parameters, with the default priors that they have at the ring bender's ranges "
                 f"(+-{RING_BENDER.voltage:g} V, +-{RING_BENDER.displacement:g} um, "
                 f"{RING_BENDER.time:g} s from turn to turn"
@@ -195,7 +195,7 @@ def _without_marks(text: str) -> str:
     # The text that is shown for a name in a role, or the last part of its path.
     role = re.compile(r":\w+:`(?:([^<`]+?)\s*<[^`]*>|~?(?:[\w.]*\.)?(\w+))`")
     text = role.sub(lambda name: name[1] or name[2], text)
-    paragraphs = (p if "\n " in f"\n{p}" else _wrapped(p) for p in text.split("\n\n"))
+    paragraphs = (p if "\n " in f"\n{p}" else _wrap(p) for p in text.split("\n\n"))
     return "\n\n".join(paragraphs)
 
 
@@ -205,7 +205,7 @@ def _parameter(numbered: Sequence[Declaration], of: str) -> Iterator[str]:
     unit = "no unit" if declared.unit == "-" else declared.unit
     names = declared.name if last is declared else f"{declared.name} to {last.name}"
     until = "" if last is declared else f", and so on to: {last.description}"
-    yield _wrapped(f"{names} ({unit}): {declared.description}{until}", "  ")
+    yield _wrap(f"{names} ({unit}): {declared.description}{until}", "  ")
     limits = declared.stated_bounds or ("positive" if declared.positive else "")
     scopes = {"record": "of each record", "event": "of an event in one record"}
     scope = scopes.get(declared.scope, f"of the {of}")
@@ -220,4 +220,4 @@ def _parameter(numbered: Sequence[Declaration], of: str) -> Iterator[str]:
     if default is None:
         why = f" ({declared.without_default})" if declared.without_default else ""
         text = f"no default: give prior or fixed{why}"
-    yield _wrapped(f"{facts}; {text}{condition}", "      ")
+    yield _wrap(f"{facts}; {text}{condition}", "      ")

@@ -78,7 +78,7 @@ def fit(
     from bwbayes.app.running.folder import RunFolder
     from bwbayes.app.study.resolve import resolve_config
 
-    config, where, records = _asked(record, keys, "fit")
+    config, where, records = _parse_subject(record, keys, "fit")
     path, scratch = folder_or_scratch(folder, "run")
     console = console_of(progress)
     resolved = resolve_config(config, where, records)
@@ -179,7 +179,7 @@ def compare(
             fits = job.fits_of(listed)
         comparison = job.compare(fits, console, future=future, workers=workers, executor=executor)
     else:
-        config, where, records = _asked(compared_runs, keys, "compare")
+        config, where, records = _parse_subject(compared_runs, keys, "compare")
         named_models = USUAL_MODELS if models is None else models
         text = named_models if isinstance(named_models, str) else "; ".join(named_models)
         comparison = job.compare_models(
@@ -202,7 +202,7 @@ def compare(
     return comparison
 
 
-def _asked(
+def _parse_subject(
     subject: Any, keys: Mapping[str, Any], call: str
 ) -> tuple[Config, Path, dict[str, Record]]:
     """Return what is to be fitted, where its files are, and the records in memory by name."""
@@ -215,7 +215,7 @@ def _asked(
     for name in keys:
         raise InputError(f"{call}: {name}: say it in the config, or give a record")
     path = Path(subject)
-    return load(path).renamed(path.stem, None), path.parent, {}
+    return load(path).with_name(path.stem, None), path.parent, {}
 
 
 def open_run(folder: str | Path) -> Run:

@@ -46,11 +46,11 @@ class Plots:
                 for key, picture in pictures(self._fit.result).items()
                 if key.partition("_")[0] == kind
             }
-            return self._styled(_named(shown, name or next(iter(shown), kind))[1].draw)
+            return self._draw(_select(shown, name or next(iter(shown), kind))[1].draw)
 
         return draw
 
-    def _styled(self, draw: Callable[..., Figure], *shown: Any) -> Figure:
+    def _draw(self, draw: Callable[..., Figure], *shown: Any) -> Figure:
         return draw_styled(draw, *shown, quantities=self._fit.quantities)
 
     def __dir__(self) -> list[str]:
@@ -59,9 +59,9 @@ class Plots:
     def record(self, kind: str = "time", name: str | None = None) -> Figure:
         """Draw a training record: along "time", as a "loop", or its "drive"'s spectrum."""
         study = self._fit.study
-        name, record = _named(study.records, name)
+        name, record = _select(study.records, name)
         shown = record_pictures(record, study.training[name], findings_of(study)[name])
-        return self._styled(_named(shown, kind)[1].draw)
+        return self._draw(_select(shown, kind)[1].draw)
 
     def loop(self, *names: str) -> Figure:
         """Draw displacement against voltage with its bands, and its tip enlarged.
@@ -69,14 +69,14 @@ class Plots:
         By default for all that was predicted with the fit, or for the bands of these names.
         """
         bands = self._fit.bands
-        return self._styled(draw_kind, "loop", [_named(bands, name)[1] for name in names or bands])
+        return self._draw(draw_kind, "loop", [_select(bands, name)[1] for name in names or bands])
 
     def tracking(self, tracked: Tracking) -> Figure:
         """Draw what ``fit.track()`` returns: error against frequency, for each controller."""
-        return self._styled(draw_tracking, tracked.to_pandas(), CONTROLLERS)
+        return self._draw(draw_tracking, tracked.to_pandas(), CONTROLLERS)
 
 
-def _named[T](items: Mapping[str, T], name: str | None) -> tuple[str, T]:
+def _select[T](items: Mapping[str, T], name: str | None) -> tuple[str, T]:
     """Return what is called so, and its name; without one the first."""
     name = next(iter(items)) if name is None else name
     if name not in items:

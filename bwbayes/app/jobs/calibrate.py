@@ -209,7 +209,7 @@ def _finish(
 ) -> Calibration:
     """Make the missing replicates, judge all, and write the files of the run's folder."""
     folder, study, seed, plan = run.folder, run.study, run.study.seed, common.plan
-    requested, entries = _read(folder, common, identity)
+    requested, entries = _read_replicates(folder, common, identity)
     if replicates not in (None, requested):
         requested = replicates or requested
         _append(folder, _Request(replicates=requested, of=identity).model_dump_json())
@@ -284,7 +284,7 @@ def _append(folder: RunFolder, line: str) -> None:
         os.fsync(file.fileno())
 
 
-def _read(
+def _read_replicates(
     folder: RunFolder, common: CalibrationSetup, identity: str
 ) -> tuple[int, dict[int, Entry]]:
     """Read how many replicates were requested, and those that are written; cut off half a line."""

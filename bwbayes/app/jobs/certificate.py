@@ -329,13 +329,13 @@ def _displacement(run: Run, draws: FloatArray, bands: Bands) -> Measurand:
         beyond = run.extrapolations[bands.name]
         rng = study.generator(f"budget {record.sha256}")
 
-        def begun(posterior: Posterior, own_draws: FloatArray) -> InitialStates:
+        def estimate_states(posterior: Posterior, own_draws: FloatArray) -> InitialStates:
             theta = posterior.prior.theta(own_draws)
             return estimate_initial_states(posterior, theta, record, validation.start, rng)
 
         alone = study.posterior.for_record(of)
         own_draws = study.posterior.select_draws(draws, of)
-        states = begun(alone, own_draws)
+        states = estimate_states(alone, own_draws)
         reached = reaching(study, draws, of, record, beyond)
     else:
         of = next(name for name in study.records if bands.name in study.windows(name))
@@ -356,7 +356,7 @@ def _displacement(run: Run, draws: FloatArray, bands: Bands) -> Measurand:
 
     displacement = values(states)
     if reached is not None and reached[0] is not alone:
-        crept = begun(*reached)
+        crept = estimate_states(*reached)
         creep = np.var(values(crept)) - np.var(displacement)
         added[CREEP] = max(float(creep), 0.0)
     dataset = alone.single_record

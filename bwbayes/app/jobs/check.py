@@ -51,7 +51,7 @@ def check(
     shown = {f"{name}: {issue}" for name, issues in findings.items() for issue in issues}
     remarks = [remark for remark in run.record_remarks if remark not in shown]
     remarks += map(str, consistency.conflicts(posterior.prior, likely, study.defaults))
-    remarks += map(str, identifiability.undetermined(posterior, point))
+    remarks += map(str, identifiability.undetermined_directions(posterior, point))
     if explained is None:
         explaining = partial(watch, "explanations")
         explained = {n: explain_record(study, n, point.optima, explaining) for n in study.records}

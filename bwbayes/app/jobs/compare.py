@@ -142,7 +142,7 @@ def compare_models(
             "workers": workers,
             "executor": pool,
         }
-        screened = batch(_screened, [*folders.items()], kind="models screened", **together)
+        screened = batch(_screen_model, [*folders.items()], kind="models screened", **together)
         candidates = {candidate.name: candidate for candidate in screened}
         criteria = {
             name: np.array([candidate.log_evidence, candidate.log_likelihood], dtype=np.float64)
@@ -154,7 +154,7 @@ def compare_models(
             for name, values in criteria.items()
             if not screen or folders[name].numbers() or np.any(values >= within_reach)
         ]
-        for candidate in batch(_sampled, sampled, kind="models sampled", **together):
+        for candidate in batch(_sample_model, sampled, kind="models sampled", **together):
             candidates[candidate.name] = candidate
             console.print(f"{candidate.name}: {candidate.stop_reason}", highlight=False)
         with ProgressLine(console, "comparing ..."):
@@ -261,7 +261,7 @@ def _description(name: str, study: Study, stop_reason: str, *, converged: bool) 
     )
 
 
-def _screened(name: str, folder: RunFolder) -> Candidate:
+def _screen_model(name: str, folder: RunFolder) -> Candidate:
     """Say what a model is worth by its MAP estimate."""
     run = begin(folder)
     study, rng = run.study, run.study.generator("evidence")
@@ -272,7 +272,7 @@ def _screened(name: str, folder: RunFolder) -> Candidate:
     )
 
 
-def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
+def _sample_model(name: str, folder: RunFolder, future: bool) -> Candidate:
     """Sample a model to its end, from wherever it stands, and say what it is worth."""
     is_finished = bool(folder.numbers())
     quiet = Console(quiet=True)

@@ -24,7 +24,7 @@ from bwbayes.app.jobs.fit_methods import amplifier_limits, conditions_at
 from bwbayes.app.study.from_config import open_like
 from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import Compensation, compensate as compensated
-from bwbayes.control.exported import Exported, exported
+from bwbayes.control.exported import Exported, export_model
 from bwbayes.control.loop import LoopNoise, Robustness, Stand
 from bwbayes.control.references import SHAPES, Reference, build_reference
 from bwbayes.control.tracking import Tracking, track as tracked
@@ -332,7 +332,7 @@ def export(
         study, voltage, slew, current, capacitance, beyond_training=beyond_training
     )
     model = replace(
-        exported(name, actuator, of_actuator(read).mean(axis=0), limits, sds),
+        export_model(name, actuator, of_actuator(read).mean(axis=0), limits, sds),
         standing=fit.standing,
         instruments=study.record.instruments,
     )

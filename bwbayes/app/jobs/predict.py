@@ -24,7 +24,7 @@ import numpy as np
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.study.from_config import open_like
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.extrapolation import beyond_training, unexcited
+from bwbayes.diagnosis.extrapolation import beyond_training, unexcited_note
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.diagnosis.rivals import Rival, disagreement
@@ -42,7 +42,7 @@ from bwbayes.model.spec import ModelSpec
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.prediction.bands import Bands, Correction, Kind, LeadIn, correct  # noqa: F401
 from bwbayes.prediction.prediction import (
-    continued,
+    continue_record,
     forecast,
     predict_record,
     predict_windows,
@@ -269,7 +269,7 @@ def _of_drives_alike(
 
 def _notes(bands: Bands, beyond: Iterable[Finding]) -> tuple[str, ...]:
     """Say where a drive leaves that of training, and by how much its bands are wider for that."""
-    notes = (bands.model_error_note, unexcited(beyond), *(finding.note for finding in beyond))
+    notes = (bands.model_error_note, unexcited_note(beyond), *(finding.note for finding in beyond))
     return tuple(note for note in notes if note)
 
 
@@ -355,7 +355,7 @@ def predict_after(
     """
     watch(0.0)
     study, record = run.study, run.study.records[of]
-    longer, after = continued(record, voltage), slice(record.samples, None)
+    longer, after = continue_record(record, voltage), slice(record.samples, None)
     beyond = beyond_training(study.posterior, longer.inputs, after)
     planned = Record(voltage, None, interval=record.interval)
     source = study.generator(f"forecast {planned.sha256}")

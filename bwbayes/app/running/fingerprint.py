@@ -74,8 +74,8 @@ def require_own(run: Run, chain: Path, attributes: Mapping[str, str | int]) -> N
         first, *others = differing
         also = f" (also {', '.join(others)})" if others else ""
         raise InputError(
-            f"{chain}: {first} was {_shown(before.get(first))} when the chain was sampled, is "
-            f"{_shown(now.get(first))}{also}; undo the edit or start a new run"
+            f"{chain}: {first} was {_show(before.get(first))} when the chain was sampled, is "
+            f"{_show(now.get(first))}{also}; undo the edit or start a new run"
         )
 
 
@@ -86,7 +86,7 @@ def versions(engine: Engine = "numpy") -> dict[str, str]:
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
-def _shown(value: object) -> str:
+def _show(value: object) -> str:
     """Write a value as a config does, more or less; a prior as a function of its arguments."""
     if isinstance(value, Mapping):
         arguments = ", ".join(f"{k} {v}" for k, v in value.items() if k != "distribution")

@@ -337,16 +337,16 @@ class CampaignFolder(Folder):
         """Tell whether a record's run has ended, and is about the files as they are now."""
         try:
             mark = (self.run(file.stem) / "ended.json").read_text(encoding="utf-8")
-            return mark == self._ended(file.stem, self.digests(file))
+            return mark == self._ended_digests(file.stem, self.digests(file))
         except (OSError, UnicodeError):
             return False
 
     def mark_done(self, name: str, digests: Mapping[str, str]) -> None:
         """Note that a record's run has ended, and the digests of the files that it is about."""
-        mark = self._ended(name, digests)
+        mark = self._ended_digests(name, digests)
         (self.run(name) / "ended.json").write_text(mark, encoding="utf-8")
 
-    def _ended(self, name: str, digests: Mapping[str, str]) -> str:
+    def _ended_digests(self, name: str, digests: Mapping[str, str]) -> str:
         """Return the digests of a run that ended with that of its summary, JSON."""
         summary = sha256((self.run(name) / "summary.json").read_bytes()).hexdigest()
         return json.dumps({**digests, "summary": summary})

@@ -198,11 +198,11 @@ class ByValue(Executor):
 
     def submit[**P, T](self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Send a call by value."""
-        sent: Future[T] = self.pool.submit(_called, cloudpickle.dumps(partial(fn, *args, **kwargs)))
+        sent: Future[T] = self.pool.submit(_invoke, cloudpickle.dumps(partial(fn, *args, **kwargs)))
         return sent
 
 
-def _called(call: bytes) -> Any:
+def _invoke(call: bytes) -> Any:
     """Make a call, with one thread for linear algebra as everywhere."""
     with one_thread():
         return pickle.loads(call)()

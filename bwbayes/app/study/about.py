@@ -14,9 +14,9 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running import fingerprint
 from bwbayes.diagnosis.consistency import conflicts, disagreements
 from bwbayes.diagnosis.explanations import TIED, likely_causes
-from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
+from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited_note
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.identifiability import undetermined
+from bwbayes.diagnosis.identifiability import undetermined_directions
 from bwbayes.diagnosis.innovations import departures
 from bwbayes.diagnosis.record_checks import UNTOLD, inspect
 from bwbayes.diagnosis.residual_analysis import Explanation
@@ -92,7 +92,7 @@ def findings_of(study: Study) -> dict[str, tuple[Finding, ...]]:
         no_matter += UNTOLD
     if study.spec.operator.name == "linear":
         no_matter += tuple(kind for kind in UNTOLD if kind != "few readings")
-    no_matter += _followed(study)
+    no_matter += _followed_kinds(study)
     findings = {}
     for name, record in study.records.items():
         # Borders that differ by less than half a sample are the same.
@@ -131,12 +131,12 @@ def record_remarks(
         if source.outliers is not None
     ]
     for name, beyond in extrapolations.items():
-        notes = (unexcited(beyond), *(finding.note for finding in beyond))
+        notes = (unexcited_note(beyond), *(finding.note for finding in beyond))
         remarks += [f"{name}: {note}" for note in notes if note]
     return tuple(remarks)
 
 
-def _followed(study: Study) -> tuple[str, ...]:
+def _followed_kinds(study: Study) -> tuple[str, ...]:
     """Return the kinds of findings that the model itself takes into account."""
     return ("late displacement", "late voltage") if "delay" in study.spec.chain else ()
 
@@ -147,7 +147,7 @@ def _unlike(name: str, record: Record, study: Study) -> Iterator[str]:
         fix = finding.fix
         if finding.kind == "switch-on transient":  # nothing here is fitted
             fix = f"lead_in_start = {record.clock(finding.stop)} under [validation.{name}]"
-        if finding.kind not in UNTOLD + _followed(study):
+        if finding.kind not in UNTOLD + _followed_kinds(study):
             yield f"{name}: {replace(finding, fix=fix)}"
 
 
@@ -177,7 +177,7 @@ def run_remarks(run: Run, watch: Watch = unwatched) -> list[str]:
     looked_at(1)
     remarks += map(str, conflicts(posterior.prior, run.flat_draws, study.defaults))
     looked_at(1)
-    remarks += map(str, undetermined(posterior, run.chain.point))
+    remarks += map(str, undetermined_directions(posterior, run.chain.point))
     looked_at(1)
     if not run.converged:
         return remarks

@@ -76,7 +76,7 @@ def study_of(
         records,
         training or {},
         frozenset(name for name in records if config.records[name].from_rest),
-        {name: _stated(name, parameter) for name, parameter in config.parameters.items()},
+        {name: _statement_of(name, parameter) for name, parameter in config.parameters.items()},
         tuple(config.model.per_record),
         tuple(config.model.shared),
         resolve_engine(config.sampling.engine),
@@ -85,7 +85,7 @@ def study_of(
     )
 
 
-def _stated(name: str, parameter: ParameterConfig) -> Stated:
+def _statement_of(name: str, parameter: ParameterConfig) -> Stated:
     """Return what a config says of a parameter."""
     prior = None
     if parameter.prior is not None:
@@ -186,7 +186,7 @@ def training_records(
     signals: dict[str, str | SignalConfig] = {}
     for name, source in config.records.items():
         if source.signal is None:
-            records[name] = _read(source, folder, in_memory.get(name), place_of(name))
+            records[name] = _read_record(source, folder, in_memory.get(name), place_of(name))
         else:
             signals[name] = source.signal
             rate = config.stand.sample_rate
@@ -198,7 +198,7 @@ def training_records(
         stand = stand_of(config, list(records.values()))
         for name, drive in signals.items():
             purpose = "record" if name == ALONE else f"record {name}"
-            records[name] = _measured(stand, drive, generator(config.seed, purpose))
+            records[name] = _measure(stand, drive, generator(config.seed, purpose))
     for name, source in config.records.items():
         record, table = records[name], place_of(name)
         end = record.start + record.duration
@@ -274,7 +274,7 @@ def join_records(config: Config, records: Mapping[str, Record]) -> tuple[Config,
             names = ", ".join([first, *others, first])
             raise InputError(f"{place_of(first)}.continues: a circle ({names}); one is the first")
         first = before.pop(name)
-        config = _appended(config, first, name, wholes)
+        config = _append_record(config, first, name, wholes)
         before = {n: first if b == name else b for n, b in before.items()}
     return config, wholes
 
@@ -307,7 +307,7 @@ def _require_next(config: Config, before: str, name: str, records: Mapping[str, 
             raise InputError(f"{place_of(name)}.continues: {reason}")
 
 
-def _appended(config: Config, before: str, name: str, records: dict[str, Record]) -> Config:
+def _append_record(config: Config, before: str, name: str, records: dict[str, Record]) -> Config:
     """Put a record behind another, in ``records`` too; windows and outliers are on one clock."""
     first, other = records[before], records.pop(name)
     shift = first.start + first.duration - other.start
@@ -337,7 +337,7 @@ def _appended(config: Config, before: str, name: str, records: dict[str, Record]
     return config.model_copy(update={"record": tables, "validation": validation})
 
 
-def _measured(
+def _measure(
     stand: VirtualTestStand, drive: str | SignalConfig, rng: np.random.Generator
 ) -> Record:
     record = stand.run(sampled_waveform(drive), rng)
@@ -345,7 +345,7 @@ def _measured(
     return replace(record, origin=f"{record.origin}, {name} signal")
 
 
-def _read(
+def _read_record(
     source: RecordConfig | ValidationConfig, folder: Path, in_memory: Record | None, table: str
 ) -> Record:
     """Return the record that is in memory, or else read the source's file."""
@@ -396,12 +396,14 @@ def validations_of(
             for key in ("input", "output"):
                 stated[key] = getattr(source, key) or getattr(config.records[of], key)
             told_source = source.model_copy(update=stated)
-            record = _read(told_source, folder, in_memory.get(name), table).like(training[of])
+            record = _read_record(told_source, folder, in_memory.get(name), table).like(
+                training[of]
+            )
             if source.missing is None:
                 record = record.without_values(config.records[of].missing or ())
         else:
             stand = stand_of(config, list(training.values()))
-            record = _measured(stand, source.signal, generator(config.seed, f"record {name}"))
+            record = _measure(stand, source.signal, generator(config.seed, f"record {name}"))
         if source.file is None or name in in_memory:
             _require_usable(record, table)
         # Its hold is its own, unless given.

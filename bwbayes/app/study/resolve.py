@@ -47,7 +47,7 @@ def resolve_config(
     Raises InputError: anything in the config or the records that cannot be used.
     """
     with _quantities(config, records or {}).spoken():
-        return _resolved(*_read(config, folder, records or {}))
+        return _resolve(*_read_records(config, folder, records or {}))
 
 
 def resolve_models(
@@ -62,7 +62,7 @@ def resolve_models(
     """
     runs = {}
     with _quantities(config, records).spoken():
-        config, study, stand = _read(config, folder, records)
+        config, study, stand = _read_records(config, folder, records)
         for name, model in models.items():
             other = study.with_model(model.spec)
             declared = {declared.name for declared in declarations_of(model.spec, study.extent)}
@@ -72,7 +72,7 @@ def resolve_models(
                 "truth": {n: v for n, v in config.truth.items() if n.partition("[")[0] in declared},
             }
             changed = _of_study(config.model_copy(update=changes), other)
-            runs[name] = _resolved(changed, other, stand)
+            runs[name] = _resolve(changed, other, stand)
     return runs
 
 
@@ -84,7 +84,7 @@ def _quantities(config: Config, in_memory: Mapping[str, Record]) -> Quantities:
     return Quantities.of(source.input, source.output)
 
 
-def _read(
+def _read_records(
     config: Config, folder: Path, in_memory: Mapping[str, Record]
 ) -> tuple[Config, Study, VirtualTestStand | None]:
     """Read the records of a config; return its study, and its stand.
@@ -110,7 +110,7 @@ def _read(
     return config, study_of(config, fitted, training, validations), stand
 
 
-def _resolved(config: Config, study: Study, stand: VirtualTestStand | None) -> Run:
+def _resolve(config: Config, study: Study, stand: VirtualTestStand | None) -> Run:
     """Make a run of a config whose records are read."""
     remarks = []
     if not study.quantities.has_clock:

@@ -18,8 +18,8 @@ from bwbayes.inference.compiled import kernels, whitening
 from bwbayes.inference.compiled.filter import PAIR, FilterState, Transition
 from bwbayes.inference.compiled.kernels import RecordArrays, Unknowns
 from bwbayes.inference.compiled.lanes import apart, read_only
-from bwbayes.inference.compiled.motion import Motion, Shared, physics, simulated
-from bwbayes.inference.compiled.stages import CompiledDrive, Given, advance_of, prepared
+from bwbayes.inference.compiled.motion import Motion, Shared, known_motion, physics
+from bwbayes.inference.compiled.stages import CompiledDrive, Given, advance_of, prepare_drive
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.compiled import compiling
@@ -66,11 +66,11 @@ def products(
     second = True if noise.states > 1 else None
     # A displacement that is simulated beforehand only passes the filter here.
     simulates = bool(actuator.stages) or is_known
-    core, make = (actuator.linear, simulated) if simulates else (actuator, physics)
+    core, make = (actuator.linear, known_motion) if simulates else (actuator, physics)
     shared = Shared.of(core, record.voltage)
     pairs, logs = np.empty((len(theta), series, series)), np.empty(len(theta))
     pair = PAIR[:series, :series]
-    for rows, source in _staged(likelihood, column, record.voltage, displacement):
+    for rows, source in _stage_groups(likelihood, column, record.voltage, displacement):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = source.models.equilibrium
         named = make(actuator, sections, column, equilibrium, record.voltage)
@@ -102,7 +102,7 @@ def whiten(
     steps = [_step(noise, theta, 1.0 + number) for number in gaps[0].tolist()]
     transitions, gained = (np.stack(matrices) for matrices in zip(*steps, strict=True))
     # Numba would compile the function for each layout of an array.
-    return whitening.whitened(
+    return whitening.whiten_series(
         transitions, gained, noise.stationary(theta), noise.observe,
         np.ascontiguousarray(theta[:, :1] ** 2 if sensor is None else sensor), gaps[1],
         np.ascontiguousarray(series),
@@ -175,7 +175,7 @@ def _step(noise: Noise, theta: FloatArray, readings: float) -> tuple[FloatArray,
     return noise.transition(theta, readings), noise.process_covariance(theta, readings)
 
 
-def _staged(
+def _stage_groups(
     likelihood: Likelihood, column: Values, voltage: FloatArray, displacement: FloatArray | None
 ) -> Iterator[tuple[IntArray | slice, CompiledDrive]]:
     """Yield groups of models, and the stage that makes their drive.
@@ -196,7 +196,7 @@ def _staged(
         return
     operator, others = actuator.hysteresis, np.arange(column["offset"].size)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
-    stage = prepared(operator, column, voltage, memory)
+    stage = prepare_drive(operator, column, voltage, memory)
     if stage is not None:
         yield slice(None), stage
         return

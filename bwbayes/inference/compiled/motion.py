@@ -92,7 +92,7 @@ def physics(
     return rows | {row: column[name] for row, name in others.items() if name in column}
 
 
-def simulated(
+def known_motion(
     actuator: Actuator,  # noqa: ARG001  # its work is done
     sections: Sections,
     column: Values,  # noqa: ARG001

@@ -75,7 +75,7 @@ class CompiledDrive(NamedTuple):
     models: Models
 
 
-def prepared(
+def prepare_drive(
     operator: Operator, column: Values, voltage: FloatArray, memory: Any
 ) -> CompiledDrive | None:
     """Return the stage for an operator's models; None if NumPy has to make the drive."""
@@ -111,8 +111,8 @@ def _compiled_drive_of(
 ) -> Any:
     del owner, group, voltage, first, out
     stages: dict[type, Any] = {
-        Given: _given,
-        Stepped: _stepped,
+        Given: _copy_drive,
+        Stepped: _step_models,
         Relaxing: relaxing,
         Branches: along_branches,
     }
@@ -171,7 +171,7 @@ def _steps_moved(
 
 
 @inner(fastmath={"contract", "nsz"})
-def _given(
+def _copy_drive(
     owner: None,  # noqa: ARG001
     models: Given,
     group: int,
@@ -190,7 +190,7 @@ def _given(
 
 
 @inner()
-def _stepped(
+def _step_models(
     step: HysteresisStep,
     models: Stepped,
     group: int,

@@ -24,7 +24,7 @@ from bwbayes.inference.compiled.stages import (
     advance_of,
     drive_of,
     move_lanes,
-    prepared,
+    prepare_drive,
 )
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.compiled import compiling
@@ -91,7 +91,7 @@ def _walk_core(
             return along(operator, column, next_inputs.voltage, memory)
 
         memory = actuator.begin(column, voltage, from_rest=from_rest)
-        compiled = prepared(operator, column, voltage, memory)
+        compiled = prepare_drive(operator, column, voltage, memory)
     source = compiled or CompiledDrive(None, Given.of(advance(inputs[:1], memory)[0]))
     sections = actuator.sections(column)
     named = physics(actuator, sections, column, source.models.equilibrium, voltage)

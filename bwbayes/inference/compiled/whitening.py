@@ -22,7 +22,7 @@ PIECE, TOGETHER = 16, 32
 
 
 @compile_cached(error_model="numpy")
-def whitened(
+def whiten_series(
     transitions: FloatArray,
     gained: FloatArray,
     stationary: FloatArray,

@@ -287,7 +287,7 @@ class MaxwellSlip(Plays):
             "displacement per volt of long sweeps, when all elements slip",
             lambda ranges: 1.4 * ranges.slope,
             0.5,
-            bounds=lambda earlier: (_held(earlier), np.inf),
+            bounds=lambda earlier: (_sum_known(earlier), np.inf),
             stated_bounds="the sum of all alpha <= d",
         )
         return (slope, *(_below_d(element) for element in self.elements()), INITIAL)
@@ -301,7 +301,7 @@ class MaxwellSlip(Plays):
 
     def slope(self, column: Values) -> FloatArray:
         """Return the slope just after a turn, d − Σ α_j."""
-        return np.asarray(column["d"] - _held(column))
+        return np.asarray(column["d"] - _sum_known(column))
 
 
 def _below_d(element: Declaration) -> Declaration:
@@ -311,11 +311,11 @@ def _below_d(element: Declaration) -> Declaration:
 
     def bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
         others = {name: values for name, values in earlier.items() if name != element.name}
-        return 0.0, others.get("d", np.array(np.inf)) - _held(others)
+        return 0.0, others.get("d", np.array(np.inf)) - _sum_known(others)
 
     return replace(element, bounds=bounds)
 
 
-def _held(earlier: Values) -> FloatArray:
+def _sum_known(earlier: Values) -> FloatArray:
     """Return Σ α_j of those that are known."""
     return np.asarray(sum(values for name, values in earlier.items() if name.startswith(ELEMENT)))

@@ -94,7 +94,7 @@ class _Lag(Stage):
         return response
 
 
-def _declared(name: str, label: str, whose: str, unit: str, range_: str) -> tuple[Declaration, ...]:
+def _declare(name: str, label: str, whose: str, unit: str, range_: str) -> tuple[Declaration, ...]:
     """Declare time constant and speed before the record."""
 
     def speed(context: Context) -> Distribution:
@@ -130,7 +130,7 @@ class AmplifierLag(_Lag):
     starts: ClassVar = ({}, {"amplifier_lag": 1.0}, {"amplifier_lag": -0.5, "lag": 0.0})
     advice: ClassVar = "record the amplifier's output voltage"
     side: ClassVar[Side] = "input"
-    parameters = _declared("amplifier_lag", "\\tau_{a}", "amplifier", "V", "voltage")
+    parameters = _declare("amplifier_lag", "\\tau_{a}", "amplifier", "V", "voltage")
 
     def is_held(self, timing: Timing) -> bool:
         """Tell whether the command is."""
@@ -144,7 +144,7 @@ class SensorLag(_Lag):
     starts: ClassVar = ({}, {"sensor_lag": 1.0}, {"sensor_lag": -0.5, "lag": 0.0})
     advice: ClassVar = "widen the sensor's filter"
     side: ClassVar[Side] = "output"
-    parameters = _declared("sensor_lag", "\\tau_{s}", "sensor", "um", "displacement")
+    parameters = _declare("sensor_lag", "\\tau_{s}", "sensor", "um", "displacement")
 
 
 # Time constants of first-order lags in a row, by name. A record determines them as a set, but

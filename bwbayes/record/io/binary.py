@@ -169,7 +169,7 @@ def _series(
             notes[f"{prefix}{name}"] = {key: _note(item.attrs, key) for key in stated}
             unit = next((_note(item.attrs, k) for k in item.attrs if k.lower()[:4] == "unit"), "")
             unit = unit.partition(" since ")[0]  # of dates: "seconds since 2026-03-03"
-            load = partial(_loaded, path, item.name)
+            load = partial(_load_unpacked, path, item.name)
             columns = _columns(item, items)
             yield from vectors(prefix, name, item.shape, item.dtype, load, unit, columns)
     for item in items.values():
@@ -246,7 +246,7 @@ def _open(path: Path, *, remark: bool = False) -> Any:
     raise InputError(f"{path}: {problem}; close it there, or run `h5clear -s` on it, and try again")
 
 
-def _loaded(path: Path, name: str) -> Any:
+def _load_unpacked(path: Path, name: str) -> Any:
     # Attributes that may scale or shift raw numbers in an unknown way, and their neutral values.
     factors = {
         **dict.fromkeys(("gain", "scale", "scaling", "factor", "slope", "calibration"), (0.0, 1.0)),
@@ -262,10 +262,10 @@ def _loaded(path: Path, name: str) -> Any:
                     advice = f"if 1 stands for that, say so as a unit, '{factor[0]:g} V'"
                     remark = one_line(f"{path}: {name.strip('/')}: {fact}; {advice}")
                     warnings.warn(remark, InputWarning, stacklevel=6)
-        return _unpacked(file[name][()], attributes)
+        return _unpack(file[name][()], attributes)
 
 
-def _unpacked(values: Any, attributes: Any) -> Any:
+def _unpack(values: Any, attributes: Any) -> Any:
     """Return packed numbers by the CF conventions: ``scale_factor * values + add_offset``.
 
     Numbers equal to ``_FillValue`` or ``missing_value`` become nan. Source: CF 1.11, 2.5.1 and 8.1.

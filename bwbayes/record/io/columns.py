@@ -360,7 +360,7 @@ def conversion(unit: str, to: str) -> Conversion | None:
     if match[2] == to.strip():
         return lambda values: factor * values
     registry: Any = pint.get_application_registry()
-    (source_unit, size), (target, target_size) = map(_spelled, (match[2], to))
+    (source_unit, size), (target, target_size) = map(_spell_unit, (match[2], to))
     try:
         source_unit, target = registry.parse_units(source_unit), registry.parse_units(target)
         registry.Quantity(1.0, source_unit).to(target)
@@ -374,7 +374,7 @@ def conversion(unit: str, to: str) -> Conversion | None:
     return convert
 
 
-def _spelled(unit: str) -> tuple[Any, float]:
+def _spell_unit(unit: str) -> tuple[Any, float]:
     """Return a unit in pint's spelling, and the factor from the given unit to it.
 
     A number behind a letter, as in ``uC/cm2``, is a power. Gauss and oersted, which belong to
@@ -424,7 +424,7 @@ def in_stated_quantities(
         if series is not None:
             series_by_key[key] = series
             columns.pop(key, None)
-            changed[series.name] = _converted(source, series, key, quantity, unit)
+            changed[series.name] = _convert(source, series, key, quantity, unit)
     truth = next((s for s in source.series if _parts(s, quantities.output)[0] == "truth"), None)
     if truth is not None and quantities.output != DISPLACEMENT:
         changed[truth.name] = replace(truth, alias="truth_um", unit="")
@@ -467,7 +467,7 @@ def _series_of(
     return in_unit[0]
 
 
-def _converted(source: Source, series: Series, key: str, quantity: Quantity, unit: str) -> Series:
+def _convert(source: Source, series: Series, key: str, quantity: Quantity, unit: str) -> Series:
     """Return a series with its numbers in the stated unit, under the package's own name."""
     unit = unit or _parts(series, quantity)[1] or quantity.unit
     convert = conversion(unit, quantity.unit)

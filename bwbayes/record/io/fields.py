@@ -63,7 +63,7 @@ def record_fields(
         table, grid = table.only(rows), grid.only(rows)
     if "displacement" in table.columns:
         table = _without_marks(table)
-    values = {name: _converted(table, name) for name in table.columns if name != "time"}
+    values = {name: _convert_column(table, name) for name in table.columns if name != "time"}
     if values["voltage"].size < _MINIMUM_SAMPLES:
         raise table.error(
             f"too short, samples: {values['voltage'].size}; give at least {_MINIMUM_SAMPLES}"
@@ -111,7 +111,7 @@ def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:
     """
     _check_lengths(table)
     table, grid = _grid(_without_empty_ends(table))
-    values = _converted(table, "displacement")
+    values = _convert_column(table, "displacement")
     if np.isnan(values).any():
         sample = int(np.argmax(np.isnan(values)))
         raise table.error("not a number; give one at every sample", "displacement", sample)
@@ -190,7 +190,7 @@ def _check_moving(table: ColumnTable, quantity: str, values: FloatArray) -> None
         raise table.error(problem, quantity)
 
 
-def _converted(table: ColumnTable, quantity: str) -> FloatArray:
+def _convert_column(table: ColumnTable, quantity: str) -> FloatArray:
     """Convert a column to the package's unit; refuse numbers not finite or absurdly large."""
     column = table.values[quantity]
     largest = 1e12 if quantity == "time" else 1e9  # s; V or um, whatever the actuator
@@ -214,7 +214,7 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
 
 def _grid(table: ColumnTable) -> tuple[ColumnTable, Grid]:
     if "time" in table.columns:
-        return time_grid(table, _converted(table, "time"))
+        return time_grid(table, _convert_column(table, "time"))
     name, column = next(iter(table.columns.items()))
     stated, start, _ = column.clock or Clock(0.0)
     interval = 1 / table.naming.fs if table.naming.fs else stated
@@ -383,10 +383,10 @@ def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
         problem = "; ".join(error.problem for error in errors)
         fs = rates[0] if rates else None
         raise ColumnsError(problem, guess["columns"], guess["units"], fs=fs)
-    return _joined(tables["voltage"], tables["displacement"], naming)
+    return _join_tables(tables["voltage"], tables["displacement"], naming)
 
 
-def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> ColumnTable:
+def _join_tables(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> ColumnTable:
     path, other = voltage.source.path, displacement.source.path
     reading, read = displacement.columns["displacement"], displacement.values["displacement"]
     kept = [q for q in voltage.columns if q not in ("displacement", "truth")]

@@ -330,7 +330,7 @@ def tables_of(lines: Sequence[str]) -> list[TextTable]:
     return [TextTable(range(*starts[i : i + 2]), *names) for i, names in enumerate(named)]
 
 
-def described(tables: Sequence[TextTable], lines: Sequence[str]) -> list[str]:
+def describe_tables(tables: Sequence[TextTable], lines: Sequence[str]) -> list[str]:
     """Describe each of several tables by its number of rows and its header."""
     rows = [sum(map(bool, map(_ROW.match, lines[t.lines.start : t.lines.stop]))) for t in tables]
     heads = [f" below {t.header[:60]!r}" * (t.header not in ("", t.title)) for t in tables]

@@ -298,7 +298,7 @@ def ranges_of(series: Sequence[Series]) -> dict[str, tuple[float, float]]:
     return {name: (v.min(), v.max()) for name, v in values.items() if v.size}
 
 
-def listed(series: Sequence[Series], ranges: Mapping[str, tuple[float, float]]) -> str:
+def list_series(series: Sequence[Series], ranges: Mapping[str, tuple[float, float]]) -> str:
     """List series of equal length with their ranges, the most usual length first."""
     numbers = [s for s in series if s.name in ranges]
     listed = []
@@ -326,7 +326,7 @@ def series_named(source: Source, name: str | int, quantity: str) -> Series:
     problem = "several columns" if matches else "no column"
     raise InputError(
         f"{source.path}: {problem} {name!r} for the {quantity}; choose another. "
-        f"{listed(matches or source.series, ranges_of(matches or source.series))}"
+        f"{list_series(matches or source.series, ranges_of(matches or source.series))}"
     )
 
 
@@ -383,7 +383,7 @@ def columns_error(
             proposed[quantity] = pool[0]
     sensitivities = _guess_units(proposed, units)
     unknown = [q for q in unknown if units[q] == _guess(chosen[q].label, q)]
-    listing = listed(source.series, ranges)
+    listing = list_series(source.series, ranges)
     lost = [q for q in missing if q not in columns]
     if lost:
         other = ", or say in which file it is, `displacement_file=FILE`"
@@ -478,7 +478,7 @@ def with_own_times(
         text = one_line(f"{differ}, but {chosen['time'].name!r} counts for both; {advice}")
         warnings.warn(text, InputWarning, stacklevel=5)
         return dict(chosen)
-    clocked = {q: _clocked(series, seconds[q]) for q, series in read.items()}
+    clocked = {q: _with_clock(series, seconds[q]) for q, series in read.items()}
     if not all(series.clock for series in clocked.values()):
         advice = "write both at the same times, or name the column of times that counts for both"
         raise InputError(one_line(f"{differ}, and not uniform; {advice}"))
@@ -511,7 +511,7 @@ def _seconds(times: Series, naming: Naming) -> FloatArray:
     return np.asarray(factor * values * 10.0**power)
 
 
-def _clocked(series: Series, seconds: FloatArray) -> Series:
+def _with_clock(series: Series, seconds: FloatArray) -> Series:
     """Return a series with the clock of its times, up to where they end, if they are uniform."""
     interval = float(seconds[-1] - seconds[0]) / (seconds.size - 1)
     uniform = seconds[0] + interval * np.arange(seconds.size)

@@ -39,7 +39,7 @@ from bwbayes.record.io.layout import (
     Layout,
     cells_of,
     clock_above,
-    described,
+    describe_tables,
     find_header,
     find_layout,
     index_of,
@@ -68,7 +68,7 @@ def read_text(path: Path, table: int | str | None = None) -> Source:
     or a line has another number of fields, and the text names the line.
     Warns InputWarning: if lines above the header are skipped.
     """
-    return text_source(path, _decoded(path), table)
+    return text_source(path, _decode(path), table)
 
 
 def text_source(
@@ -87,7 +87,7 @@ def text_source(
     lines = without_units(_without_foot(written))
     is_whole |= len(lines) < len(written)
     tables = tables_of(lines)
-    descriptions = described(tables, lines) if tables[1:] else ()
+    descriptions = describe_tables(tables, lines) if tables[1:] else ()
     chosen, _, shared = tables[index_of(path, [t.title for t in tables], table, descriptions)]
     is_whole |= chosen.stop < len(lines)
     # Replace the tables above by empty lines, so that the other lines keep their numbers; a block
@@ -126,7 +126,7 @@ def text_source(
         remark = f"{path}:{first}: {skipped} line{'s' * (skipped > 1)} among the numbers skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     scope_clock = scope_clock or clock_above(notes, preamble, len(body))
-    frame, marks = _parsed(path, body, layout)
+    frame, marks = _parse_cells(path, body, layout)
     names = _different(path, names, frame)
     series = []
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
@@ -180,7 +180,7 @@ def write_text(record: Record, path: Path) -> None:
         pd.DataFrame(columns).to_csv(file, index=False, lineterminator="\n")
 
 
-def _decoded(path: Path) -> str:
+def _decode(path: Path) -> str:
     """Return a file's text with line ends as on Unix, whatever its encoding is."""
     with path.open("rb") as file:
         is_packed = file.read(2) == b"\x1f\x8b"
@@ -283,7 +283,7 @@ def _samples(
     return samples
 
 
-def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFrame, Marks]:
+def _parse_cells(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFrame, Marks]:
     """Return the cells, as numbers in columns that hold numbers alone, and their marks."""
     # Fortran writes 1.5D+00.
     text = re.sub(r"[dD](?<=[\d.].)(?=[+-]?\d)", "e", "\n".join(body))

@@ -58,16 +58,16 @@ def draw(result: Result) -> dict[str, Markup]:
     return {name: _page_json(plot, i, say) for i, (name, plot) in enumerate(plots.items())}
 
 
-def _said(node: Any, say: Callable[[str], str], key: str = "") -> Any:
+def _translate(node: Any, say: Callable[[str], str], key: str = "") -> Any:
     """Return the JSON of a plot with its labels in the words of the run's quantities."""
     if isinstance(node, str):
         return say(node) if key in ("axis_label", "text", "value", "tooltips") else node
     if isinstance(node, list):
         # Change a tooltip's label, not its value, which names a column of the source.
         is_pair = key == "tooltips" and len(node) == 2 and isinstance(node[0], str)
-        return [say(node[0]), node[1]] if is_pair else [_said(item, say, key) for item in node]
+        return [say(node[0]), node[1]] if is_pair else [_translate(item, say, key) for item in node]
     if isinstance(node, dict):
-        return {name: _said(item, say, name) for name, item in node.items()}
+        return {name: _translate(item, say, name) for name, item in node.items()}
     return node
 
 
@@ -80,7 +80,7 @@ def _page_json(plot: models.Model, number: int, say: Callable[[str], str]) -> Ma
     document.add_root(plot)
     item = {
         "root_id": plot.id,
-        "doc": _said(document.to_json(deferred=False), say),
+        "doc": _translate(document.to_json(deferred=False), say),
         "version": __version__,
     }
     text = json.dumps(item)
