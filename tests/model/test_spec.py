@@ -1,17 +1,23 @@
 """A model's spec: a chain of stages to be changed, compared, and written as a config has it."""
 
 import json
+import tomllib
 
+import numpy as np
 import pytest
+import tomlkit
 from hypothesis import given, strategies as st
 
 from bwbayes.app.config.config import ModelConfig
+from bwbayes.control.exported import export_model
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES
-from bwbayes.model.inputs import Span
+from bwbayes.model.inputs import Limits, Span
+from bwbayes.model.inverse import inverse
 from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
 from bwbayes.model.spec import Extent, ModelSpec, StageSpec
+from tests.control import cases
 
 FURTHER = (*TERMS, *STAGES, "creep")
 
@@ -45,6 +51,30 @@ def test_a_spec_is_what_a_config_says(spec: ModelSpec, other: ModelSpec) -> None
     assert (spec == other) == (not spec.changes_to(other))
     config = ModelConfig.model_validate(other.keys).with_spec(spec)
     assert ModelConfig.model_validate(config.model_dump()).spec == spec
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("lag",), ("second-order", "quadratic", "backlash"), ("plays", "amplifier-lag", "creep")],
+    ids=", ".join,
+)
+def test_a_spec_alone_declares_simulates_inverts_and_prints_a_model(names: tuple[str, ...]) -> None:
+    """Its keys make it again, its command gives the displacement, and C has both ways."""
+    spec = ModelSpec(hold="first").with_stages(*names)
+    text = tomlkit.dumps({"model": spec.keys})
+    assert ModelSpec.from_keys(tomllib.loads(text)["model"]) == spec
+    actuator = spec.actuator(1e-3, "first", Extent(cases.SPAN, 1e-3, 10.0))
+    theta = cases.theta(actuator)
+    assert theta.shape == (1, len(actuator.declarations))
+    voltage = 40 * np.sin(np.linspace(0, 6, 400)) ** 3
+    displacement = actuator.displacement(theta, voltage, from_rest=True)
+    command = inverse(actuator, theta, displacement, from_rest=True)
+    moved = actuator.displacement(theta, command[0], from_rest=True)
+    np.testing.assert_allclose(moved, displacement, rtol=0, atol=1e-6)
+    assert (
+        "double actuator_inverse("
+        in export_model("made", actuator, theta[0], Limits(*cases.SPAN)).c_code()
+    )
 
 
 def test_an_unknown_history_is_refused() -> None:

@@ -580,8 +580,7 @@ def _begun_run(file: Path, campaign: CampaignFolder) -> Run:
             raise InputError(f"{file}: {proposal.blocking_issue.error}")
         config, in_memory = proposal.config, {ALONE: proposal.record}
     # All have the same model.
-    model = config.model.model_copy(update={"search": "none"})
-    config = config.model_copy(update={"name": file.stem, "model": model})
+    config = config.with_search("none").model_copy(update={"name": file.stem})
     run = resolve_config(config, where, in_memory)
     path = campaign.run(file.stem)
     if path.exists():
