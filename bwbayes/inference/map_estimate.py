@@ -113,8 +113,8 @@ def fit(
             target = Target(with_residuals_of(thinned, posterior, theta))
             first = beginning(posterior, SAMPLES)
             noise = prior.unconstrain(prior.draw(generator, DRAWS))[:, target.noise]
-            climbed = [climb(target, place[np.newaxis]).coordinates for place in places]
-            places = [_with_noise(first, place, noise, generator) for place in climbed]
+            climbed = [climb(target, position[np.newaxis]).coordinates for position in places]
+            places = [_with_noise(first, position, noise, generator) for position in climbed]
         for start_point in watched(places, part(watch, 0.5, 1.0)):
             _add_mode(posterior, modes, start_point)
     for start_point in further:

@@ -75,8 +75,8 @@ def thin(dataset: Likelihood, stride: int) -> Likelihood:
         return dataset
     voltage = dataset.voltage[::stride].copy()
     for branch in [*monotone_stretches(voltage)][:-1]:
-        place = stride * branch.last
-        nearby = dataset.voltage[max(place - stride + 1, 0) : place + stride]
+        position = stride * branch.last
+        nearby = dataset.voltage[max(position - stride + 1, 0) : position + stride]
         voltage[branch.last] = nearby.max() if branch.direction > 0 else nearby.min()
     inputs = replace(dataset.inputs[::stride], voltage=voltage, voltage_is="output")
     actuator = replace(

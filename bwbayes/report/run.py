@@ -96,7 +96,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
         title=result.name,
         about="; ".join(about),
         banners=[
-            *_verdict_banners(result, numbers),
+            *_validation_banners(result, numbers),
             *_calibration_banner(numbers),
             *remarks_banner(result.remarks),
         ],
@@ -104,7 +104,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     )
 
 
-def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]:
+def _validation_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]:
     """Return the banners with the outcome of the run, for the page and for the screen."""
     standing = result.standing
     if not result.outcome.converged:

@@ -389,9 +389,9 @@ def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
 def _join_tables(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> ColumnTable:
     path, other = voltage.source.path, displacement.source.path
     reading, read = displacement.columns["displacement"], displacement.values["displacement"]
-    kept = [q for q in voltage.columns if q not in ("displacement", "truth")]
-    columns = {quantity: voltage.columns[quantity] for quantity in kept}
-    values = {quantity: voltage.values[quantity] for quantity in kept}
+    driven = [q for q in voltage.columns if q not in ("displacement", "truth")]
+    columns = {quantity: voltage.columns[quantity] for quantity in driven}
+    values = {quantity: voltage.values[quantity] for quantity in driven}
     samples, readings = values["voltage"].size, read.size
     if samples != readings and reading.clock is None:
         raise InputError(
