@@ -92,12 +92,14 @@ class PowerStep(OneStateStep):
         rising = tabulate(exponents, saturating=True)
         falling = tabulate(exponents, saturating=False, top=max(farthest, default=0.0))
         cells = 1 << (max(rising.shape[2], falling.shape[2]) - 1).bit_length()
-        tables = np.full((2, d.size, ROWS, cells), np.inf)
-        tables[:, :, :, : rising.shape[2]] = rising[row]
-        tables[1, soft] = np.inf
-        tables[1, soft, :, : falling.shape[2]] = falling[row[soft]]
+        parameters = np.full((d.size, TABLE + 2 * ROWS * cells), np.inf)
         numbers = d, alpha, *rates, below, above, exponent
-        return cls(np.column_stack([*numbers, tables.swapaxes(0, 1).reshape(d.size, -1)]))
+        parameters[:, :TABLE] = np.stack(numbers, axis=1)
+        tables = parameters[:, TABLE:].reshape(d.size, 2, ROWS, cells)
+        tables[:, 0, :, : rising.shape[2]] = rising[row]
+        tables[~soft, 1, :, : rising.shape[2]] = rising[row[~soft]]
+        tables[soft, 1, :, : falling.shape[2]] = falling[row[soft]]
+        return cls(parameters)
 
     @staticmethod
     def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
