@@ -232,7 +232,7 @@ def test_states_of_tries_are_those_of_their_draw() -> None:
     likelihood = replace(posterior.likelihood, from_rest=False)
     rng = np.random.default_rng(3)
     theta = np.repeat(posterior.prior.theta(np.empty((1, 0))), 5, axis=0)
-    theta = likelihood.table.replaced(theta, "beta", rng.uniform(0.02, 0.05, 5))
+    theta = likelihood.table.with_values(theta, "beta", rng.uniform(0.02, 0.05, 5))
     tried, repeated = States(likelihood, theta, 4), States(likelihood, np.repeat(theta, 4, axis=0))
     quantile = rng.uniform(size=20)
     np.testing.assert_allclose(tried.at(quantile), repeated.at(quantile))
