@@ -42,26 +42,26 @@ from bwbayes.watching import Watch, unwatched
 DEMAGNETIZED = "demagnetized, and then driven straight from 0 V to the record's first voltage"
 
 
-def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def nonlinearity(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try quadratic and cubic terms of the voltage."""
-    nonlinearity = scene.posterior.single_record.actuator.nonlinearity
+    nonlinearity = analysis.posterior.single_record.actuator.nonlinearity
     present = set(nonlinearity.terms) if nonlinearity else set()
     for terms in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
         if not present.issuperset(terms) and present.issubset(terms):
-            yield from scene.changed(f"{' and '.join(terms)} nonlinearity", stages=terms)
+            yield from analysis.changed(f"{' and '.join(terms)} nonlinearity", stages=terms)
 
 
-def creep(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def creep(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try slow lags."""
-    if scene.posterior.single_record.actuator.creep is None:
-        yield from scene.changed("creep", stages=("creep",))
+    if analysis.posterior.single_record.actuator.creep is None:
+        yield from analysis.changed("creep", stages=("creep",))
 
 
-def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def dynamics(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a mass on a spring; readings show the ratios of its parameters alone."""
-    if scene.posterior.single_record.actuator.dynamics == "second-order":
+    if analysis.posterior.single_record.actuator.dynamics == "second-order":
         return
-    frequency = 10 / scene.turn_time
+    frequency = 10 / analysis.turn_time
     stiffness, damping = ((2 * np.pi * frequency) ** power for power in (2, 1))
     stated = {
         "mass": Stated(fixed=1.0),
@@ -70,12 +70,12 @@ def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
     }
     starts = [{"stiffness": z, "damping": z / 2 - 1} for z in (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0)]
     sighting = Sighting(stated, starts)
-    yield from scene.changed("second-order dynamics", "", ("second-order",), sighting)
+    yield from analysis.changed("second-order dynamics", "", ("second-order",), sighting)
 
 
-def exponent(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def exponent(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try another exponent of the hysteresis's transition, if that is fixed at 1."""
-    fixed = {parameter.name: parameter.fixed for parameter in scene.posterior.prior.parameters}
+    fixed = {parameter.name: parameter.fixed for parameter in analysis.posterior.prior.parameters}
     if fixed.get("exponent") == 1.0:
         # In nearly all published fits it lies below 5.
         prior = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
@@ -85,129 +85,132 @@ def exponent(scene: ResidualAnalysis) -> Iterator[Explanation]:
         def words(values: Mapping[str, float]) -> tuple[str, str]:
             return f"transition of exponent {values['exponent']:.2g} instead of 1", ""
 
-        yield from scene.changed("free exponent", words, sighting=sighting)
+        yield from analysis.changed("free exponent", words, sighting=sighting)
 
 
-def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanation]:
+def without(analysis: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanation]:
     """Try the model without each of these stages: a stage whose removal gains is not needed."""
     for name in names:
         # An operator, hold or noise was replaced, not added: it cannot be removed.
-        if name not in {*scene.study.spec.chain} - {*HYSTERESIS}:
+        if name not in {*analysis.study.spec.chain} - {*HYSTERESIS}:
             continue
-        spec = scene.study.spec.without(name)
-        posterior = scene.rebuilt(scene.study.with_model(spec))
-        rows = [scene.posterior.names.index(one) for one in posterior.names]
-        fit = scene.extended(posterior, scene.places[:, rows])
-        fix = lines(scene.study.spec, spec)
-        yield scene.explained(name, f"no {name}", fix, fit, spec=spec)
+        spec = analysis.study.spec.without(name)
+        posterior = analysis.rebuilt(analysis.study.with_model(spec))
+        rows = [analysis.posterior.names.index(one) for one in posterior.names]
+        fit = analysis.extended(posterior, analysis.places[:, rows])
+        fix = lines(analysis.study.spec, spec)
+        yield analysis.explained(name, f"no {name}", fix, fit, spec=spec)
 
 
-def hold(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def hold(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try the other hold of the voltage between samples."""
-    other = "first" if scene.whole.single_record.actuator.hold == "zero" else "zero"
+    other = "first" if analysis.whole.single_record.actuator.hold == "zero" else "zero"
     text = "voltage that is held between samples"
     if other == "first":
         text = "voltage that changes steadily between samples"
-    yield from scene.changed("hold", text, hold=other)
+    yield from analysis.changed("hold", text, hold=other)
 
 
-def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def operator(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try other hysteresis operators."""
-    present = type(scene.posterior.single_record.actuator.hysteresis)
+    present = type(analysis.posterior.single_record.actuator.hysteresis)
     # Try a compiled operator of each family, and plays of any weights, for loops without a formula.
     for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
         if HYSTERESIS[name] is present:
             continue
-        for spec in _histories(scene, scene.study.spec.with_stages(name)):
+        for spec in _histories(analysis, analysis.study.spec.with_stages(name)):
             kind, text = f"operator {name}", f"another operator, {name}"
-            if spec.history != scene.study.spec.history:
+            if spec.history != analysis.study.spec.history:
                 kind, text = f"{kind}, demagnetized", f"{text}, {DEMAGNETIZED}"
-            if not scene.looks_for(kind):
+            if not analysis.looks_for(kind):
                 continue
-            posterior = scene.rebuilt(scene.study.with_model(spec))
+            posterior = analysis.rebuilt(analysis.study.with_model(spec))
             # One start finds the best mode of nearly all records, in half of the time of five.
-            places = scene.local_minima(posterior, 1)
-            fit = scene.extended(posterior, places)
-            yield scene.explained(
+            places = analysis.local_minima(posterior, 1)
+            fit = analysis.extended(posterior, places)
+            yield analysis.explained(
                 kind,
                 text,
-                lines(scene.study.spec, spec),
+                lines(analysis.study.spec, spec),
                 fit,
                 spec=spec,
                 place=fit.place,
             )
 
 
-def history(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def history(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a voltage that came straight from 0 V, where the operator's start cannot be that."""
-    for spec in _histories(scene, scene.study.spec)[1:]:
-        yield from scene.changed("history", f"hysteresis {DEMAGNETIZED}", history=spec.history)
+    for spec in _histories(analysis, analysis.study.spec)[1:]:
+        yield from analysis.changed("history", f"hysteresis {DEMAGNETIZED}", history=spec.history)
 
 
-def _histories(scene: ResidualAnalysis, spec: ModelSpec) -> list[ModelSpec]:
+def _histories(analysis: ResidualAnalysis, spec: ModelSpec) -> list[ModelSpec]:
     """Return a model as it is, and with the history that its unknown start does not hold, if any.
 
     On a first curve from zero volts, an operator that remembers extrema moves otherwise than after
     a drive over all voltages. The misfit of that half period spoils the fit of all others.
     """
-    record = scene.posterior.single_record
+    record = analysis.posterior.single_record
     if record.from_rest or spec.history != "unknown":
         return [spec]
-    posterior = scene.rebuilt(scene.study.with_model(spec))
+    posterior = analysis.rebuilt(analysis.study.with_model(spec))
     if not isinstance(posterior.single_record.actuator.hysteresis, RemembersExtrema):
         return [spec]
     return [spec, replace(spec, history="demagnetized")]
 
 
-def smooth(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def smooth(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a discrepancy without corners, in place of a rough one."""
-    if isinstance(scene.posterior.single_record.noise, DiscrepancyNoise) and scene.before is None:
-        yield from scene.changed("a smooth discrepancy", flags={"noise": True}, noise="smooth")
+    if (
+        isinstance(analysis.posterior.single_record.noise, DiscrepancyNoise)
+        and analysis.before is None
+    ):
+        yield from analysis.changed("a smooth discrepancy", flags={"noise": True}, noise="smooth")
 
 
-def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def prior(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try the default prior of each parameter that has another one.
 
     The fit may have left the other prior, or further parameters may have compensated for it.
     """
-    before, defaults = scene.posterior.prior, scene.study.defaults if scene.alone else {}
+    before, defaults = analysis.posterior.prior, analysis.study.defaults if analysis.alone else {}
     for parameter in before.free:
         default = defaults.get(parameter.name)
         if default is None or parameter.prior == default:
             continue
         parameters = [replace(p, prior=default) if p is parameter else p for p in before.parameters]
-        posterior = replace(scene.posterior, prior=JointPrior(parameters, before.constraint))
+        posterior = replace(analysis.posterior, prior=JointPrior(parameters, before.constraint))
         places = [
-            posterior.prior.unconstrain(before.constrain(scene.places)[0]),
-            scene.local_minima(posterior, 1),
+            posterior.prior.unconstrain(before.constrain(analysis.places)[0]),
+            analysis.local_minima(posterior, 1),
         ]
-        fit = scene.extended(posterior, np.concatenate(places))
+        fit = analysis.extended(posterior, np.concatenate(places))
         text = f"prior of {parameter.name}, {parameter.prior}, that excludes the record's value"
         fix = conflict_fix(parameter.name, default)
-        yield scene.explained(f"prior of {parameter.name}", text, fix, fit, foreign=True)
+        yield analysis.explained(f"prior of {parameter.name}", text, fix, fit, foreign=True)
 
 
-def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def heavy_tails(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try innovations of a Student t distribution of any scale, if there is an outlier."""
-    white = scene.innovations
+    white = analysis.innovations
     far = np.abs(white) > 5
     if not far.any():
         return
     text = f"outliers ({np.sum(far)} of {white.size} innovations beyond 5 SD)"
-    others = (scene.posterior.single_record.readings.values - scene.fit.displacement)[~far]
-    rmse = scene.without[0], float(np.sqrt(np.mean(others**2)))
+    others = (analysis.posterior.single_record.readings.values - analysis.fit.displacement)[~far]
+    rmse = analysis.without[0], float(np.sqrt(np.mean(others**2)))
     fix, spec, nats = "set outliers = true in [model]", None, tail_nats(white)
     # Add no tails if outliers are few and far off: such tails would be too heavy for the others.
-    before, tailed = scene.study.spec, scene.posterior.single_record.noise.tailed
-    paced = scene.posterior.single_record.noise.paced
-    if scene.alone and not (tailed or paced) and nats > isolated_nats(white):
+    before, tailed = analysis.study.spec, analysis.posterior.single_record.noise.tailed
+    paced = analysis.posterior.single_record.noise.paced
+    if analysis.alone and not (tailed or paced) and nats > isolated_nats(white):
         spec = replace(before, noise=f"{before.noise} + student")
         fix = lines(before, spec)
     yield Explanation(
         "heavy tails",
         text,
         fix,
-        nats=nats - scene.lead,
+        nats=nats - analysis.lead,
         rmse=rmse,
         foreign=True,
         noise=True,
@@ -252,11 +255,11 @@ def isolated_nats(white: FloatArray) -> float:
     return density - cost
 
 
-def growing_noise(scene: ResidualAnalysis) -> Iterator[Explanation]:
+def growing_noise(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     """Try innovations of sd exp(a + b g), g the drive's speed or distance from its center."""
-    rows, white = scene.posterior.single_record.readings.rows, scene.innovations
-    center = (scene.voltage.max() + scene.voltage.min()) / 2
-    for kind, drive in (("speed", scene.rate), ("voltage", scene.voltage - center)):
+    rows, white = analysis.posterior.single_record.readings.rows, analysis.innovations
+    center = (analysis.voltage.max() + analysis.voltage.min()) / 2
+    for kind, drive in (("speed", analysis.rate), ("voltage", analysis.voltage - center)):
         growth = np.abs(drive)[rows]
         if not np.std(growth) > 0:
             continue
@@ -273,14 +276,14 @@ def growing_noise(scene: ResidualAnalysis) -> Iterator[Explanation]:
         nats = cost(np.array([level, 0.0])) - optimum.fun - 0.5 * np.log(1 + 2 * white.size)
         text = f"noise that {'grows' if slope > 0 else 'falls'} with the voltage"
         text += "'s speed" if kind == "speed" else "'s distance from its center"
-        rmse = scene.without[0], scene.fit.rmse
+        rmse = analysis.without[0], analysis.fit.rmse
         fix = "train on a record driven as the plans are: the bands' width is the mean one"
-        spec, noise = None, scene.posterior.single_record.noise
-        if kind == "speed" and slope > 0 and scene.alone and not (noise.tailed or noise.paced):
-            spec = replace(scene.study.spec, noise=f"{scene.study.spec.noise} + paced")
-            fix = lines(scene.study.spec, spec)
+        spec, noise = None, analysis.posterior.single_record.noise
+        if kind == "speed" and slope > 0 and analysis.alone and not (noise.tailed or noise.paced):
+            spec = replace(analysis.study.spec, noise=f"{analysis.study.spec.noise} + paced")
+            fix = lines(analysis.study.spec, spec)
         explanation = Explanation(
-            f"noise by {kind}", text, fix, nats=float(nats - scene.lead), rmse=rmse
+            f"noise by {kind}", text, fix, nats=float(nats - analysis.lead), rmse=rmse
         )
         yield replace(explanation, noise=True, spec=spec)
 
@@ -317,7 +320,9 @@ TIED = float(np.log(20))
 
 
 def explain(
-    scene: ResidualAnalysis, watch: Watch = unwatched, is_over: Callable[[], bool] = lambda: False
+    analysis: ResidualAnalysis,
+    watch: Watch = unwatched,
+    is_over: Callable[[], bool] = lambda: False,
 ) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
@@ -334,13 +339,13 @@ def explain(
             raise _OutOfTimeError
 
     best: dict[str, Explanation] = {}
-    scene = replace(scene, watch=hurry)
-    if scene.posterior.single_record.is_followed(scene.fit.displacement):
+    analysis = replace(analysis, watch=hurry)
+    if analysis.posterior.single_record.is_followed(analysis.fit.displacement):
         return ()
-    looked_at, rough = scene, scene.with_rough_noise()
+    looked_at, rough = analysis, analysis.with_rough_noise()
     # With several records, the model of the actuator is a matter of all of them.
-    kinds = (*ADDITIONS, *(CHANGES if scene.alone else (LONG_DELAY.explanations,)))
-    if not scene.posterior.single_record.inputs.quantities.has_clock:
+    kinds = (*ADDITIONS, *(CHANGES if analysis.alone else (LONG_DELAY.explanations,)))
+    if not analysis.posterior.single_record.inputs.quantities.has_clock:
         # Besides stages that depend on time.
         timed = (growing_noise, creep, dynamics, hold, smooth)
         kinds = tuple(kind for kind in kinds if kind not in timed)
@@ -348,10 +353,10 @@ def explain(
         if is_over():
             break
         if number == sum(kind in ADDITIONS for kind in kinds):
-            if scene.unexplained <= LIMIT and all(e.nats <= LIMIT for e in best.values()):
+            if analysis.unexplained <= LIMIT and all(e.nats <= LIMIT for e in best.values()):
                 break
-            looked_at = scene.of_beginning()
-            rough = rough if looked_at is scene else looked_at.with_rough_noise()
+            looked_at = analysis.of_beginning()
+            rough = rough if looked_at is analysis else looked_at.with_rough_noise()
         explanations = [] if rough is None else [*_in_time(kind(rough))]
         lead = 0.0 if rough is None else rough.lead
         worth = frozenset(cause.kind for cause in explanations if cause.nats + lead > LIMIT)
@@ -368,7 +373,7 @@ def explain(
     noises = [explanation for explanation in ranked if explanation.noise]
     for explanation in (*better_models(ranked), *likely_causes(noises)):
         with suppress(_OutOfTimeError):
-            best[explanation.kind] = scene.confirmed(explanation)
+            best[explanation.kind] = analysis.confirmed(explanation)
     watch(1.0)
     return _ranked(best.values())
 

@@ -101,7 +101,7 @@ def test_a_free_exponent_is_taken_while_the_noise_is_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It leaves stages and noise as they are, and states another prior."""
-    monkeypatch.setattr(explaining, "explain", lambda scene, *_: tuple(exponent(scene)))
+    monkeypatch.setattr(explaining, "explain", lambda analysis, *_: tuple(exponent(analysis)))
     chosen = choose_model(resolve_config(config_of("free exponent", tmp_path), tmp_path))
     assert chosen.steps[0].startswith("added: transition of exponent ")
     assert chosen.run.config.model.hysteresis == "bouc-wen"
@@ -218,7 +218,7 @@ def test_fits_of_a_search_end_when_its_time_is_over(
     """Within a fit, after one round more: with what explains the readings by then."""
     study = resolve_config(config_of("quadratic", tmp_path), tmp_path).study
     point = pointfit.fit(study.posterior, np.random.default_rng(1))
-    scene = explaining._scene(study, "record", point.optima)
+    analysis = explaining._analysis(study, "record", point.optima)
     rounds, climbed = list[int](), mode_finding.Target.round
 
     def counted(*arguments: Any) -> Any:
@@ -226,10 +226,10 @@ def test_fits_of_a_search_end_when_its_time_is_over(
         return climbed(*arguments)
 
     monkeypatch.setattr(mode_finding.Target, "round", counted)
-    complete = {found.kind for found in explain(scene)}
+    complete = {found.kind for found in explain(analysis)}
     for limit in (1, 6, 21):
         rounds.clear()
-        ended = explain(scene, is_over=partial(rounds.__contains__, limit - 1))
+        ended = explain(analysis, is_over=partial(rounds.__contains__, limit - 1))
         assert {found.kind for found in ended} < complete
         assert len(rounds) == limit
 

@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 
 from bwbayes.app.study.about import findings_of
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis import explanations, residual_analysis as scenes
+from bwbayes.diagnosis import explanations, residual_analysis
 from bwbayes.diagnosis.defects import DEFECTS, LONG_DELAY
 from bwbayes.diagnosis.explanations import (
     LIMIT,
@@ -62,7 +62,7 @@ def analysis_of(study: Study, optima: FloatArray) -> ResidualAnalysis:
     return ResidualAnalysis.of(study.posterior, optima, np.random.default_rng(0), study)
 
 
-def scene(
+def analysis(
     kind: str, seed: int, folder: Path, seconds: float = 10.0, text: str = REST
 ) -> ResidualAnalysis:
     return analysis_of(*fitted_plant(kind, seed, folder, seconds, text))
@@ -155,7 +155,7 @@ def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
 ) -> None:
     """What the actuator has not done keeps a fit from passing, whatever its bands cover."""
     text = AUTO if kind == "free exponent" else REST  # beside a smooth error alone
-    seen = scene(kind, 0, tmp_path, 5.0, text)
+    seen = analysis(kind, 0, tmp_path, 5.0, text)
     best = max(FAMILIES[kind](seen), key=lambda found: found.nats)
     assert best.kind in CAUSES.get(kind, {kind})
     assert best.nats > LIMIT
@@ -180,7 +180,7 @@ def test_no_model_that_contains_the_fitted_one_ends_below_it(
     Of the new ones each is at either end of its prior or in its middle, in all combinations: one of
     these is the fitted model, nearly, for whichever value leaves the displacement as it is.
     """
-    seen, extended, checked = scene(kind, 5, tmp_path, 5.0), ResidualAnalysis.extended, 0
+    seen, extended, checked = analysis(kind, 5, tmp_path, 5.0), ResidualAnalysis.extended, 0
     fits: list[LocalFit] = []
 
     def kept(*arguments: Any) -> LocalFit:
@@ -290,7 +290,7 @@ def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
     """With an sd of a fiftieth; the twin: one that has the truth in its middle is none."""
     truth = factor * getattr(drawn(np.random.default_rng((5, 0))), name)
     prior = f'{{ distribution = "lognormal", median = {truth}, sigma = 0.02 }}'
-    seen = scene("good", 0, tmp_path, 5.0, f"{REST}[parameters]\n{name} = {{ prior = {prior} }}")
+    seen = analysis("good", 0, tmp_path, 5.0, f"{REST}[parameters]\n{name} = {{ prior = {prior} }}")
     defects = (DEFECTS[kind].explanations for kind in ("transient", "drift", "moving gain"))
     found = [
         explanation for family in (explanations.prior, *defects) for explanation in family(seen)
@@ -303,7 +303,7 @@ def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
 
 
 def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:
-    found = list(DEFECTS["oscillation"].explanations(scene("mains", 0, tmp_path)))
+    found = list(DEFECTS["oscillation"].explanations(analysis("mains", 0, tmp_path)))
     assert found[0].nats > LIMIT
     assert found[0].text.endswith("(mains: 50 Hz)")
 
@@ -355,7 +355,7 @@ def test_a_good_plant_has_no_cause_and_a_planted_one_is_found_among_all(
     kind: str, tmp_path: Path
 ) -> None:
     """Runs that search for stages find them among all in the default suite too."""
-    found = explain(scene(kind, 1, tmp_path, 5.0))
+    found = explain(analysis(kind, 1, tmp_path, 5.0))
     causes = {cause.kind for cause in likely_causes(found)}
     assert causes & CAUSES[kind] if kind != "good" else not causes
 
@@ -373,7 +373,7 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
     # One share a kind that was tried, and that all is done.
     assert len(fitted) == len(explanations.ADDITIONS) + 1
     (tmp_path / "other").mkdir()
-    large = scene("cubic", 0, tmp_path / "other", 5.0)
+    large = analysis("cubic", 0, tmp_path / "other", 5.0)
     gained = max(found.nats for found in explanations.nonlinearity(large))
     assert LIMIT < gained < large.unexplained
 
@@ -385,7 +385,7 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     slew_limit = DEFECTS["slew limit"].explanations
     monkeypatch.setattr(explanations, "ADDITIONS", (DEFECTS["drift"].explanations,))
     monkeypatch.setattr(explanations, "CHANGES", (slew_limit,))
-    slow = scene("slew limit", 1, tmp_path, 5.0, AUTO)
+    slow = analysis("slew limit", 1, tmp_path, 5.0, AUTO)
     found = explain(slow)
     assert max(each.nats for each in slew_limit(slow)) > found[0].nats - 1
 
@@ -566,7 +566,7 @@ def test_what_leads_on_some_readings_is_weighed_on_all(
     monkeypatch.setattr(explanations, "CHANGES", (explanations.nonlinearity,))
     study, optima = fitted_plant("cubic", 0, tmp_path, 8.0, AUTO)
     full = explain(analysis_of(study, optima))[0]
-    monkeypatch.setattr(scenes, "READINGS", 200)
+    monkeypatch.setattr(residual_analysis, "READINGS", 200)
     few = analysis_of(study, optima)
     assert few.posterior.single_record.readings.rows.size <= 200
     on_few = max(explanations.nonlinearity(few), key=lambda found: found.nats)

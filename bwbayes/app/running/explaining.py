@@ -56,10 +56,10 @@ def explain_record(
     ``places`` are the posterior's modes (modes, free), coordinates; ``watch`` is called with the
     share that is done.
     """
-    return explain(_scene(study, name, places), watch)
+    return explain(_analysis(study, name, places), watch)
 
 
-def _scene(study: Study, name: str, places: FloatArray) -> ResidualAnalysis:
+def _analysis(study: Study, name: str, places: FloatArray) -> ResidualAnalysis:
     """Return a training record as explanations see it."""
     posterior, record = study.posterior, study.records[name]
     return ResidualAnalysis.of(
@@ -190,12 +190,12 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
     ties, is_over = dict[str, tuple[ModelSpec, list[Explanation]]](), False
     while not is_over:
         step = partial(watch, f"stages, round {len(steps) + 1}")
-        scene = _scene(run.study, name, point.optima)
-        explanations = explain(scene, step, lambda: clock() > seconds)
+        analysis = _analysis(run.study, name, point.optima)
+        explanations = explain(analysis, step, lambda: clock() > seconds)
         is_over = clock() > seconds
         # The last one has just been weighed.
         before = [] if is_over else [*notes][:-1]
-        needless = [removal for removal in without(scene, before) if removal.nats >= 0]
+        needless = [removal for removal in without(analysis, before) if removal.nats >= 0]
         # So has another discrepancy, if the noise is open.
         models = [
             cause
