@@ -4,8 +4,8 @@
 parameters; the others have a stage beside them, drawn from its own prior, which the search has to
 find, or may leave out where 300 readings do not show it. The parameters that all actuators share
 have 95% intervals that contain 95% of the truths; those of the chosen model alone contain fewer.
-Of 420 truths, which depend on each other in sevens, 2% are about 1.3 standard errors: intervals
-of 90% pass once in 100 times, right ones in 80.
+The truths are 420, which depend on each other in sevens: 2% are about 1.3 standard errors, and
+right intervals pass in 80 of 100 such tests.
 """
 
 from pathlib import Path

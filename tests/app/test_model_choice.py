@@ -155,7 +155,7 @@ def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_o
 def test_noise_that_grows_with_the_speed_is_as_wide_where_the_next_drive_is_fast(
     tmp_path: Path,
 ) -> None:
-    """Of 1,500 readings of each half 95%, to 3.6 sds of luck; a level band errs on both sides."""
+    """95% of 1,500 readings of each half, to 3.6 sds of luck; a level band errs on both sides."""
 
     def measured(seed: int) -> Record:
         rng = np.random.default_rng(seed)

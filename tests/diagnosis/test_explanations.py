@@ -153,7 +153,7 @@ FAMILIES: dict[str, Callable[[ResidualAnalysis], Iterator[Explanation]]] = {
 def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     kind: str, tmp_path: Path
 ) -> None:
-    """What the actuator has not done keeps a fit from passing, whatever its bands cover."""
+    """An effect that is not the actuator's keeps a fit from passing, whatever its bands cover."""
     text = AUTO if kind == "free exponent" else REST  # beside a smooth error alone
     seen = analysis(kind, 0, tmp_path, 5.0, text)
     best = max(FAMILIES[kind](seen), key=lambda found: found.nats)
@@ -177,7 +177,7 @@ def test_no_model_that_contains_the_fitted_one_ends_below_it(
 ) -> None:
     """Its mode is not less probable than any place with the fitted model's own parameters.
 
-    Of the new ones each is at either end of its prior or in its middle, in all combinations: one of
+    Each of the new ones is at either end of its prior or in its middle, in all combinations: one of
     these is the fitted model, nearly, for whichever value leaves the displacement as it is.
     """
     seen, extended, checked = analysis(kind, 5, tmp_path, 5.0), ResidualAnalysis.extended, 0
@@ -243,7 +243,7 @@ def late_records(late: float, folder: Path) -> Plant:
 def test_a_late_column_is_named_with_its_delay_and_fitted_up_to_a_quarter_of_the_period(
     late: float, tmp_path: Path
 ) -> None:
-    """Of either sign, to 1% of a period, also where a lag has grown to take its place.
+    """Either sign is found, to 1% of a period, also where a lag has grown to take its place.
 
     With the delay the sign is as it was, although displacements that are late by a quarter fall
     where the voltage rises; parameters are the plant's to 3 sds, and the next record is covered.
@@ -334,7 +334,7 @@ def test_a_line_is_told_from_one_that_swells_with_the_drive(kind: str) -> None:
 def test_a_step_among_readings_that_are_held_out_has_its_own_time(
     time: float, tmp_path: Path
 ) -> None:
-    """Not that of the first reading after them, where the fit comes upon it."""
+    """It is not that of the first reading after them, where the fit comes upon it."""
     write_record(plant("good", (5, 2), 5.0), tmp_path / "record.h5")
     study = study_of(REST, tmp_path)
     shifted = study.posterior.single_record.displacement + 5.0 * (study.record.time >= time)
@@ -531,7 +531,7 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
     """The best explanation is the same whether the path between them is left out or not.
 
     None but the best gains by it: a delay's evidence is exact to a nat, since the path has corners.
-    What does not move the drive's reversals loses nothing either.
+    Anything else, which does not move the drive's reversals, loses nothing either.
     """
     nats, (study, optima) = {}, fitted_plant(kind, 2, tmp_path)
     monkeypatch.setattr("bwbayes.diagnosis.residual_analysis.READINGS", 500)

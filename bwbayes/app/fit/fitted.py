@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -51,7 +50,6 @@ if TYPE_CHECKING:
     from bwbayes.app.running.workers import FigureWorker
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.comparison import Comparison
-    from bwbayes.diagnosis.averaging import Alternative
     from bwbayes.diagnosis.consistency import Consistency
     from bwbayes.diagnosis.finding import Finding
     from bwbayes.diagnosis.identifiability import InformationGain
@@ -72,9 +70,6 @@ if TYPE_CHECKING:
 
 # By this a chain notes what noise on the voltages leaves unsure: a covariance, (free, free).
 VOLTAGE_NOISE = "voltage_noise_covariance"
-
-# By this it notes the models that were not chosen, and that its record does not rule out.
-ALTERNATIVES = "alternatives"
 
 
 @dataclass(eq=False, repr=False)
@@ -240,23 +235,13 @@ class Run(Shown):
     @cached_property
     def averaged(self) -> FloatArray:
         """The draws as those of all models that the record does not rule out."""
-        if not self.alternatives:
-            return self._draws
-        from bwbayes.diagnosis.averaging import average
-
-        study, covariance = self.study, self.chain.point.covariance
-        source = study.generator("alternatives")
-        return average(study.posterior, self._draws, covariance, self.alternatives, source)
-
-    @cached_property
-    def alternatives(self) -> list[Alternative]:
-        """The models that were not chosen, and that the record does not rule out."""
-        noted = self.chain.attributes().get(ALTERNATIVES)
+        noted, study = self.chain.attributes().get("alternatives"), self.study
         if noted is None:
-            return []
-        from bwbayes.diagnosis.averaging import from_text
+            return self._draws
+        from bwbayes.diagnosis.averaging import average, from_text
 
-        return from_text(str(noted))
+        covariance, source = self.chain.point.covariance, study.generator("alternatives")
+        return average(study.posterior, self._draws, covariance, from_text(str(noted)), source)
 
     @cached_property
     def sampled(self) -> Result:
@@ -374,25 +359,10 @@ class Run(Shown):
         They are fitted when first needed, and kept in the folder. ``watch`` is called with the
         share that is done.
         """
+        from bwbayes.app.running.explaining import fitted_rivals
         from bwbayes.diagnosis.rivals import families
 
-        return self._rivals(of, tuple(families(self.study.spec)), watch)
-
-    def _rivals(self, of: str, specs: tuple[ModelSpec, ...], watch: Watch) -> tuple[Rival, ...]:
-        from bwbayes.app.running.fingerprint import fingerprint, load, save
-        from bwbayes.diagnosis.rivals import fit_rivals
-
-        study, path, state = self.study, self.folder.rivals, fingerprint(self)
-        fitted = load(path, state) or {}
-        of_record = fitted.setdefault(of, {})
-        if specs not in of_record:
-            rng = study.generator(f"rivals of {study.records[of].sha256}")
-            of_record[specs] = fit_rivals(study.for_record(of), specs, rng, watch)
-            # A process that predicts elsewhere may have no right to write to the folder.
-            with suppress(OSError):
-                save(path, state, fitted)
-        rivals: tuple[Rival, ...] = of_record[specs]
-        return rivals
+        return fitted_rivals(self, of, tuple(families(self.study.spec)), watch)
 
     def widening_rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...] | None:
         """Return the models whose differences widen bands of unlike drives; None without any.
@@ -402,9 +372,11 @@ class Run(Shown):
         """
         if self.drive_locks[of].locked:
             return self.rivals(of, watch)
+        from bwbayes.app.running.explaining import fitted_rivals
+
         keys = self.study.spec.keys
         tied = [ModelSpec.from_keys(keys | changes) for changes in self.config.model.tied]
-        return self._rivals(of, tuple(tied), watch) if tied else None
+        return fitted_rivals(self, of, tuple(tied), watch) if tied else None
 
     @RunStage
     def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:

@@ -310,9 +310,10 @@ def run_budgets(run: Run) -> tuple[Budget, ...]:
     name = "d" if "d" in actuators else [*actuators, *posterior.names][0]
     unit = next(p.unit for p in study.parameters if p.name == name)
     of_all = run.averaged[..., posterior.names.index(name)].reshape(-1, 1)
+    is_averaged = "alternatives" in run.chain.attributes()
     values = thin_draws(of_all, study.generator("draws"))[::2, 0]  # of the same draws
     quantities = [
-        Measurand(name, unit, values, unexplained=CHOICE if run.alternatives else ""),
+        Measurand(name, unit, values, unexplained=CHOICE if is_averaged else ""),
         loop_width(posterior, draws),
         _displacement(run, draws, shown),
     ]

@@ -12,6 +12,7 @@ is added while the fit follows what the actuator did not do: no stage mends a tr
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.app.fit.fitted import Run
+from bwbayes.app.running.fingerprint import fingerprint, load, save
 from bwbayes.app.study.resolve import with_model
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.averaging import Alternative, alternatives, remarks
@@ -27,6 +29,7 @@ from bwbayes.diagnosis.finding import TELLING_DRIVE
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
+from bwbayes.diagnosis.rivals import Rival, fit_rivals
 from bwbayes.inference import map_estimate, stopwatch
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
@@ -57,6 +60,26 @@ def explain_record(
     share that is done.
     """
     return explain(_analysis(study, name, places), watch)
+
+
+def fitted_rivals(
+    run: Run, of: str, specs: tuple[ModelSpec, ...], watch: Watch = unwatched
+) -> tuple[Rival, ...]:
+    """Return models fitted to a training record, by its name, as the run's folder keeps them.
+
+    ``watch`` is called with the share that is done.
+    """
+    study, path, state = run.study, run.folder.rivals, fingerprint(run)
+    fitted = load(path, state) or {}
+    of_record = fitted.setdefault(of, {})
+    if specs not in of_record:
+        rng = study.generator(f"rivals of {study.records[of].sha256}")
+        of_record[specs] = fit_rivals(study.for_record(of), specs, rng, watch)
+        # A process that predicts elsewhere may have no right to write to the folder.
+        with suppress(OSError):
+            save(path, state, fitted)
+    rivals: tuple[Rival, ...] = of_record[specs]
+    return rivals
 
 
 def _analysis(study: Study, name: str, places: FloatArray) -> ResidualAnalysis:

@@ -19,7 +19,7 @@ from pathlib import Path
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.fit.fitted import ALTERNATIVES, VOLTAGE_NOISE, Run, open_finished
+from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run, open_finished
 from bwbayes.app.running.explaining import choose_model
 from bwbayes.app.running.fingerprint import fingerprint, require_own, save, versions
 from bwbayes.app.running.folder import RunFolder
@@ -144,7 +144,7 @@ def _open_chain(run: Run, console: Console, requested: Engine | None = None) -> 
                 covariance = path_covariance(posterior, paths, point, source, watch_noise)
                 unsure[VOLTAGE_NOISE] = json.dumps(covariance.tolist())
             if others:
-                unsure[ALTERNATIVES] = averaging.to_text(others)
+                unsure["alternatives"] = averaging.to_text(others)
         for step in map(study.quantities.say, steps):
             console.print(step, highlight=False, soft_wrap=True)
         if run.config != config_before:
