@@ -50,6 +50,20 @@ class Alternative:
     shift: Sequence[float]
     covariance: Sequence[Sequence[float]]
 
+    @classmethod
+    def of(cls, text: str, probability: float, fit: LocalFit, chosen: LocalFit) -> Alternative:
+        """Return another model as its fit has it, of the parameters with the same prior in both."""
+        priors = {parameter.name: parameter for parameter in fit.posterior.prior.free}
+        names = [
+            shared.name
+            for shared in chosen.posterior.prior.free
+            if priors.get(shared.name) == shared
+        ]
+        ours, theirs = _columns(chosen.posterior, names), _columns(fit.posterior, names)
+        shift = fit.coordinates[theirs] - chosen.coordinates[ours]
+        covariance = fit.covariance[np.ix_(theirs, theirs)]
+        return cls(text, probability, names, shift.tolist(), covariance.tolist())
+
 
 def alternatives(
     study: Study, optima: FloatArray, others: Iterable[Explanation], watch: Watch = unwatched
@@ -63,18 +77,23 @@ def alternatives(
     counted = [cause for cause in others if _counts(study, cause)]
     if not counted:
         return []
-    here = climb(study.posterior, optima)
+    chosen = climb(study.posterior, optima)
     fits, log_odds = dict[str, LocalFit](), dict[str, float]()
     for cause in watched(counted, watch):
-        fit = _fitted(study, cause, here)
+        assert cause.spec is not None
+        other = study.with_model(cause.spec, cause.stated).posterior
+        # From where it was fitted, and from the mode with its stage.
+        starts = {**chosen.by_name, **cause.mode}, {**cause.mode, **chosen.by_name}
+        values = [[start.get(name, 0.0) for name in other.names] for start in starts]
+        fit = climb(other, np.array(values))
         # A delay leaves out readings for which it needs a voltage beyond the record.
-        compared = on_readings(here, fit.posterior)
+        compared = on_readings(chosen, other)
         nats = fit.log_evidence - compared.log_evidence - cause.cost
         if fit.follows and np.isfinite(nats):
             fits[cause.text], log_odds[cause.text] = fit, nats - np.log(KINDS)
     probabilities = scipy.special.softmax([0.0, *log_odds.values()])[1:].tolist()
     return [
-        _alternative(text, probability, here, fit)
+        Alternative.of(text, probability, fit, chosen)
         for (text, fit), probability in zip(fits.items(), probabilities, strict=True)
         if probability > LEAST
     ]
@@ -82,29 +101,9 @@ def alternatives(
 
 def _counts(study: Study, cause: Explanation) -> bool:
     """Tell whether an explanation is another model, of the same operator and not improbable."""
-    if cause.spec is None or not cause.place or cause.misleads:
+    if cause.spec is None or not cause.mode or cause.misleads:
         return False
     return cause.spec.operator == study.spec.operator and cause.nats > np.log(LEAST * KINDS)
-
-
-def _fitted(study: Study, cause: Explanation, here: LocalFit) -> LocalFit:
-    """Fit another model from where its explanation was fitted, and from the mode with its stage."""
-    assert cause.spec is not None
-    other = study.with_model(cause.spec, cause.stated).posterior
-    places = [{**here.place, **cause.place}, {**cause.place, **here.place}]
-    return climb(
-        other, np.array([[place.get(name, 0.0) for name in other.names] for place in places])
-    )
-
-
-def _alternative(text: str, probability: float, here: LocalFit, there: LocalFit) -> Alternative:
-    """Return another model as its fit has it, of the parameters with the same prior in both."""
-    priors = {parameter.name: parameter for parameter in there.posterior.prior.free}
-    names = [one.name for one in here.posterior.prior.free if priors.get(one.name) == one]
-    ours, theirs = _columns(here.posterior, names), _columns(there.posterior, names)
-    shift = there.coordinates[theirs] - here.coordinates[ours]
-    covariance = there.covariance[np.ix_(theirs, theirs)]
-    return Alternative(text, probability, names, shift.tolist(), covariance.tolist())
 
 
 def _columns(posterior: Posterior, names: Sequence[str]) -> list[int]:
@@ -124,18 +123,18 @@ def average(
     (free, free), to that of the alternative. A draw that the prior would exclude then stays.
     """
     flat = draws.reshape(-1, draws.shape[-1])
-    places, moved = posterior.prior.unconstrain(flat), flat.copy()
-    center, chance, begin = places.mean(axis=0), generator.random(len(flat)), 0.0
+    coordinates, moved = posterior.prior.unconstrain(flat), flat.copy()
+    center, chance, begin = coordinates.mean(axis=0), generator.random(len(flat)), 0.0
     for other in others:
         rows = np.flatnonzero((begin <= chance) & (chance < begin + other.probability))
         begin += other.probability
         columns = _columns(posterior, other.names)
         ours = np.linalg.cholesky(covariance[np.ix_(columns, columns)])
         theirs = np.linalg.cholesky(np.array(other.covariance))
-        place = places[rows]
-        away = (place[:, columns] - center[columns]) @ np.linalg.solve(ours.T, theirs.T)
-        place[:, columns] = center[columns] + np.array(other.shift) + away
-        values, log_prior = posterior.prior.constrain(place)
+        placed = coordinates[rows]
+        away = (placed[:, columns] - center[columns]) @ np.linalg.solve(ours.T, theirs.T)
+        placed[:, columns] = center[columns] + np.array(other.shift) + away
+        values, log_prior = posterior.prior.constrain(placed)
         possible = np.isfinite(log_prior)
         moved[rows[possible]] = values[possible]
     return moved.reshape(draws.shape)

@@ -134,7 +134,7 @@ def operator(analysis: ResidualAnalysis) -> Iterator[Explanation]:
                 lines(analysis.study.spec, spec),
                 fit,
                 spec=spec,
-                place=fit.place,
+                mode=fit.by_name,
             )
 
 

@@ -44,7 +44,7 @@ class LocalFit:
         return free
 
     @property
-    def place(self) -> dict[str, float]:
+    def by_name(self) -> dict[str, float]:
         """The coordinates by the names of their parameters."""
         return dict(zip(self.posterior.names, self.coordinates.tolist(), strict=True))
 

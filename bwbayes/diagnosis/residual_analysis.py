@@ -77,7 +77,7 @@ class Explanation(Finding):
     parameter of the actuator, in sds of both fits. A ``foreign`` effect does not come from the
     actuator, so that a fit without it has followed it. An explanation by ``noise`` leaves the
     displacement as it is. ``spec`` is the model that it is a part of, ``stated`` holds the priors
-    of new parameters, ``place`` has the coordinates of its fit by name, and ``cost`` is that of its
+    of new parameters, ``mode`` has the coordinates of its fit by name, and ``cost`` is that of its
     choice, nats. ``advice`` is the fix that leaves the model as it is, if there is one.
     """
 
@@ -88,7 +88,7 @@ class Explanation(Finding):
     noise: bool = False
     spec: ModelSpec | None = None
     stated: Mapping[str, Stated] = field(default_factory=dict)
-    place: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
+    mode: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
     cost: float = 0.0
     advice: str = ""
 
@@ -497,7 +497,7 @@ class ResidualAnalysis:
             shift=compared._shift(fit),
             spec=spec,
             stated=stated,
-            place=fit.place,
+            mode=fit.by_name,
             advice=advice,
             **flags,
         )
@@ -508,11 +508,11 @@ class ResidualAnalysis:
             self.posterior.single_record.readings.rows.size
             < self.whole.single_record.readings.rows.size
         )
-        spec, place = explanation.spec, explanation.place
-        if not is_short or spec is None or not place:
+        spec, mode = explanation.spec, explanation.mode
+        if not is_short or spec is None or not mode:
             return explanation
         other = self._of_whole(self.study.with_model(spec, explanation.stated))
-        fit = climb(other, np.array([place[name] for name in other.names]), watch=self.watch)
+        fit = climb(other, np.array([mode[name] for name in other.names]), watch=self.watch)
         before = on_readings(self._on_all, other)
         nats = fit.log_evidence - before.log_evidence - explanation.cost
         return replace(explanation, nats=nats, rmse=(before.rmse, fit.rmse))

@@ -124,8 +124,8 @@ def uncertainty_budgets(
         explained = variance
         if quantity.unexplained:
             explained = float(np.mean((moved @ slopes) ** 2))
-            rest = max(variance - explained, 0.0) / max(explained, 1e-300)
-            shares[quantity.unexplained] = shares.get(quantity.unexplained, 0.0) + rest
+            share = max(variance - explained, 0.0) / max(explained, 1e-300)
+            shares[quantity.unexplained] = shares.get(quantity.unexplained, 0.0) + share
         variances = {source: share * explained for source, share in shares.items()}
         mean = float(np.mean(quantity.values))
         relative_sds = instruments.relative_sds(quantity.unit)

@@ -62,7 +62,7 @@ def explained(study: Study) -> list[Explanation]:
             "none",
             nats=0.0,
             spec=study.spec.with_stages(stage),
-            place={"d": 0.0},
+            mode={"d": 0.0},
         )
         for stage in STAGES
     ]
@@ -116,7 +116,7 @@ def test_draws_are_those_of_all_models_together(study: Study) -> None:
     [
         lambda cause, _: replace(cause, nats=-8.0),
         lambda cause, _: replace(cause, spec=None),
-        lambda cause, _: replace(cause, place={}),
+        lambda cause, _: replace(cause, mode={}),
         lambda cause, _: replace(cause, held_out=(0.1, 0.2)),
         lambda cause, spec: replace(cause, spec=spec.with_stages("duhem")),
     ],

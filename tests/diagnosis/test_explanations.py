@@ -263,7 +263,7 @@ def test_a_late_column_is_named_with_its_delay_and_fitted_up_to_a_quarter_of_the
     assert found.spec is not None
     delayed = study.with_model(found.spec)
     assert not any("late" in finding.kind for finding in findings_of(delayed)["record"])
-    place = np.array([[found.place[name] for name in delayed.posterior.names]])
+    place = np.array([[found.mode[name] for name in delayed.posterior.names]])
     beside = ResidualAnalysis.of(delayed.posterior, place, rng, delayed)
     assert [] == [*DEFECTS["sign"].explanations(beside)]
     fitted = judge(delayed, rng)

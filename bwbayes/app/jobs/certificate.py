@@ -282,9 +282,9 @@ def _estimates(fit: Run) -> list[dict[str, Any]]:
             words, unit = MEASURES[name]
             estimates.append({"name": f"loop: {words.lower()}", "unit": unit, **measured.numbers})
     named = {estimate["name"] for estimate in estimates}
-    for one in fit.uncertainty_budgets:
-        if one.name not in named:
-            estimates.append({"name": one.name, **one.numbers})
+    for source in fit.uncertainty_budgets:
+        if source.name not in named:
+            estimates.append({"name": source.name, **source.numbers})
     for estimate in estimates:
         half = (estimate["upper_95"] - estimate["lower_95"]) / 2
         estimate["expanded_uncertainty"] = half
