@@ -119,6 +119,12 @@ CLAIMS: dict[str, Quoted] = {
     "... 300 readings: 95% intervals of each quantity cover, %": Quoted(
         ["extent 100 calibrated run/cover/*"], ["calibrated run/replicates"]
     ),
+    "95% intervals cover where a stage is drawn, too, and the search may find it, %": Quoted(
+        ["100 selection/of all models"], ["selection/actuators"]
+    ),
+    "... those of the chosen model alone, %": Quoted(
+        ["100 selection/of the chosen one"], ["selection/actuators"]
+    ),
     "95% intervals cover where the scales of sensor and monitor are drawn too, %": Quoted(
         ["extent 100 uncertain scales/cover/*"], ["uncertain scales/records"]
     ),
