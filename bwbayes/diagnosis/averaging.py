@@ -82,7 +82,7 @@ def alternatives(
     for cause in watched(counted, watch):
         assert cause.spec is not None
         other = study.with_model(cause.spec, cause.stated).posterior
-        # From where it was fitted, and from the mode with its stage.
+        # Climb from where it was fitted, and from the mode with its stage.
         starts = {**chosen.by_name, **cause.mode}, {**cause.mode, **chosen.by_name}
         values = [[start.get(name, 0.0) for name in other.names] for start in starts]
         fit = climb(other, np.array(values))
