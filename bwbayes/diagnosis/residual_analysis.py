@@ -33,7 +33,7 @@ from bwbayes.inference.thinning import (
 from bwbayes.model.inputs import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
-from bwbayes.record.voltage_path import VoltagePath
+from bwbayes.record.voltage_path import VoltagePath, with_corners
 from bwbayes.shown import rounded
 from bwbayes.watching import Watch, unwatched
 
@@ -330,16 +330,17 @@ class ResidualAnalysis:
 
     @cached_property
     def path_error_gain(self) -> float:
-        """Expected gain in log likelihood, nats, if the voltage's path were known exactly.
+        """Gain in log evidence, nats, if the voltage's path were known exactly.
 
-        A stage in front of the hysteresis may gain as much by smoothing the path's error alone. It
-        is the mean of ½ |W (x(v) − x(u))|² for paths v that are estimated of the path u with new
-        noise on it, W whitens the readings; 0 where the voltage has no noise.
+        A stage in front of the hysteresis may gain as much by smoothing the path's error alone. For
+        a noisy voltage the gain is expected: the mean of ½ |W (x(v) − x(u))|² for paths v that are
+        estimated of the path u with new noise on it, W whitens the readings. Without noise it is
+        what the record gains from a path that reaches the corners between samples.
         """
         whole, record = self.whole.single_record, self.posterior.single_record
         noise_sd = self.study.records[whole.name].path.noise_sd
         if not noise_sd:
-            return 0.0
+            return self._corner_gain
         path = VoltagePath(whole.voltage, noise_sd)
         theta = self.posterior.prior.theta(self.fit.free[np.newaxis])
 
@@ -355,6 +356,22 @@ class ResidualAnalysis:
             moved = white(replace(self.posterior, datasets=(changed,))) - white(self.posterior)
             worths.append(0.5 * float(np.sum(moved**2)))
         return float(np.mean(worths))
+
+    @property
+    def _corner_gain(self) -> float:
+        """Gain in log evidence, nats, from a voltage that reaches the corners between samples."""
+        whole, record = self.whole.single_record, self.posterior.single_record
+        inputs = replace(whole.inputs, voltage=with_corners(whole.voltage))
+        inputs = thin(replace(whole, inputs=inputs), self.stride).inputs
+        at_corner = inputs.voltage != record.voltage
+        if record.actuator.hold == "zero" or not at_corner.any():
+            return 0.0
+        # A reading is that of its sample, not of the corner beside it.
+        readings = np.where(at_corner, np.nan, record.displacement)
+        other = self.posterior.altered(inputs=inputs, displacement=readings)
+        before = on_readings(self.fit, other)
+        fit = climb(other, before.coordinates, watch=self.watch)
+        return max(fit.log_evidence - before.log_evidence, 0.0)
 
     @property
     def lead(self) -> float:

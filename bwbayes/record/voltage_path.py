@@ -33,6 +33,9 @@ from bwbayes.shown import brief
 # Half width, in sds, of the windows' intervals that have to intersect.
 WITHIN = 1.5
 
+# Part of a corner's bend that its lines may have beside it: a sine's bends are alike, a third each.
+STRAIGHT = 0.1
+
 
 @dataclass(frozen=True)
 class VoltagePath:
@@ -116,6 +119,30 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
             'voltage with less noise, or give the command (voltage_is = "command")'
         )
     return VoltagePath(path + center, sd, remark)
+
+
+def with_corners(voltage: FloatArray) -> FloatArray:
+    """Return a voltage (samples,), V, that reaches the corners between its samples.
+
+    Where two straight lines meet between two samples, the voltage turned further out than either of
+    them; the nearer one is moved there. A round extreme, as of a sine, stays as it is.
+    """
+    path = voltage.copy()
+    slope = np.diff(voltage)
+    bend = np.diff(slope)
+    # Of the line up to sample k and the one from k + 1 on; both go through another sample.
+    before, between, after = slope[1:-3], slope[2:-2], slope[3:-1]
+    turn = before - after
+    straight = np.maximum(np.abs(bend[:-3]), np.abs(bend[3:])) < STRAIGHT * np.abs(turn)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fraction = (between - after) / turn
+    (k,) = np.nonzero((before * after < 0) & straight & (fraction > 0) & (fraction < 1))
+    nearest = k + 2 + (fraction[k] > 0.5)
+    corner = voltage[k + 2] + before[k] * fraction[k]
+    # Rounding may show one corner on both sides of a sample: the further one is assigned last.
+    order = np.argsort(np.abs(corner - voltage[nearest]))
+    path[nearest[order]] = corner[order]
+    return path
 
 
 def rounding_step(voltage: FloatArray) -> float:

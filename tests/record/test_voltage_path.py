@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, strategies as st
+from hypothesis import assume, example, given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record, read_record
-from bwbayes.record.voltage_path import estimate_path, turns
+from bwbayes.record.voltage_path import estimate_path, turns, with_corners
 from bwbayes.record.waveforms import signal, signal_names
 from tests.record.drives import DRIVES, drive
 
@@ -45,6 +45,49 @@ def test_a_clean_voltage_comes_back_bit_for_bit(
     path = estimate_path(voltage)
     np.testing.assert_array_equal(path.voltage, voltage)
     assert not path.remark
+
+
+@given(
+    st.lists(st.floats(5.0, 60.0), min_size=2, max_size=8),
+    st.floats(0.01, 0.99),
+    st.floats(0.1, 1.0),
+    st.sampled_from([1e-3, 1.0, 90.0]),
+    st.floats(-2, 2),
+)
+def test_a_voltage_reaches_its_corners_between_samples(
+    spans: list[float], first: float, ratio: float, scale: float, shift: float
+) -> None:
+    """At corners as far apart as 5 samples, of lines of any two slopes, and in any unit.
+
+    The nearest sample is at the corner then, and no other one has moved. Read backwards, the
+    voltage has the same corners; one that has reached them is left as it is.
+    """
+    times = first + np.cumsum([0.0, *spans])
+    slopes = np.resize([1.0, -ratio], len(spans))
+    corners = np.concatenate([[0.0], np.cumsum(slopes * spans)])
+    samples = np.arange(np.ceil(times[0]), np.floor(times[-1]) + 1)
+    voltage = scale * (np.interp(samples, times, corners) + shift)
+    turned, position = scale * (corners + shift), times - samples[0]
+    expected = voltage.copy()
+    for time, corner in zip(position[1:-1], turned[1:-1], strict=True):
+        assume(abs(time % 1 - 0.5) > 1e-6)  # else two samples are nearest
+        if 2 <= time <= voltage.size - 3:  # a line needs three samples
+            expected[round(time)] = corner
+    extent = np.ptp(turned)
+    np.testing.assert_allclose(with_corners(voltage), expected, rtol=0, atol=1e-9 * extent)
+    backwards = with_corners(voltage[::-1])[::-1]
+    np.testing.assert_allclose(backwards, expected, rtol=0, atol=1e-9 * extent)
+
+
+@given(
+    st.sampled_from([kind for kind in sorted(DRIVES) if kind != "triangle"]),
+    SEEDS,
+    st.sampled_from([200.0, 1000.0, 4000.0]),
+)
+def test_other_extremes_than_corners_stay_as_they_are(kind: str, seed: int, rate: float) -> None:
+    """Of whatever is round, held, or rises within a sample."""
+    voltage = drive(kind, rate, np.random.default_rng(seed))
+    np.testing.assert_array_equal(with_corners(voltage), voltage)
 
 
 @given(
