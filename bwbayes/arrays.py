@@ -7,10 +7,15 @@ model (:mod:`bwbayes.model.compiled`).
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from bwbayes.errors import InputError
 
 __all__ = [
     "ArrayLike",
@@ -22,6 +27,7 @@ __all__ = [
     "gone",
     "look_up",
     "select",
+    "taking_all_models",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -53,3 +59,18 @@ def look_up(rows: Any, index: Any) -> Any:
     # The rows of a step are columns of its parameters: no copy is made here.
     numbers = rows.reshape(rows.shape[:2]).T
     return numbers.ravel().take(models * len(rows) + index.astype(np.intp))
+
+
+@contextmanager
+def taking_all_models(owner: object) -> Iterator[None]:
+    """Refuse a formula of one number that an owner brings: an ``if``, a function of ``math``."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        if not re.search("truth value|Python scalars", str(error)):
+            raise
+        raise InputError(
+            f"{type(owner).__module__}:{type(owner).__qualname__}: its formula takes one number, "
+            "not all models at once; write bwbayes.arrays.select(condition, yes, no) in place "
+            "of if, and NumPy's functions in place of those of math"
+        ) from None

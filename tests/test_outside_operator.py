@@ -147,6 +147,54 @@ class Choosing(Bent):
         return ChoosingStep(super().step(column).parameters)
 
 
+class BranchingStep(BentStep):
+    """The same step with a choice of one number."""
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return w and its slope."""
+        return BentStep.move(parameters, memory, 0.0 if voltage > 1e9 else voltage, after)
+
+
+class Branching(Bent):
+    """The operator of that step."""
+
+    def step(self, column: Values) -> BranchingStep:
+        """Return the step."""
+        return BranchingStep(super().step(column).parameters)
+
+
+@dataclass(frozen=True)
+class OneNumbered(RemembersExtrema):
+    """An operator whose branches are of one number: E = d |u − u_r|."""
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """The slope d, um/V, and the start."""
+        return d(), INITIAL
+
+    def numbers(self, column: Values) -> FloatArray:
+        """Return d."""
+        return column["d"][:, np.newaxis]
+
+    @staticmethod
+    def everett(numbers: Any, start: Any, voltage: Any) -> Any:
+        """Return E."""
+        return numbers[0] * (voltage - start if voltage > start else start - voltage)
+
+    def reachable(
+        self, column: Values, voltage: float, span: Span
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return both ends."""
+        del voltage, span
+        return -np.ones_like(column["d"]), np.ones_like(column["d"])
+
+    def typical_slope(self, column: Values, span: Span) -> FloatArray:
+        """Return d."""
+        del span
+        return column["d"]
+
+
 def play(y: Any, value: Any, half: Any) -> Any:
     """Return where a play stands, by a function that numba does not compile."""
     return np.clip(y, value - half, value + half)
@@ -280,6 +328,23 @@ def test_what_numba_cannot_compile_is_one_clear_line(
     refused = rf'^{HERE}:{said}[^\n]*bwbayes.arrays.select[^\n]*; or take engine = "numpy"$'
     with pytest.raises(InputError, match=refused):
         replace(posterior, engine="numba").log_likelihood(theta)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("BranchingStep", {"d": 0.9, "alpha": 0.2, "beta": 0.03, "bend": 2.0, "width": 40.0}),
+        ("OneNumbered", {"d": 0.9}),
+    ],
+)
+def test_a_formula_of_one_number_is_one_clear_line(kind: str, values: dict[str, float]) -> None:
+    """Wherever the operator is asked to take all models at once."""
+    operator = Branching() if kind == "BranchingStep" else OneNumbered()
+    actuator = Actuator("none", "first", 0.02, operator, span=Span(-100.0, 100.0))
+    theta = np.array([[*values.values(), 0.0, 1.0]] * 2)
+    refused = rf"^{HERE}:{kind}: its formula takes one number, .* in place of if, [^\n]*$"
+    with pytest.raises(InputError, match=refused):
+        actuator.displacement(theta, np.array([0.0, 10.0, -10.0]))
 
 
 @pytest.mark.usefixtures("_my_operator")

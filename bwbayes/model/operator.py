@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import BoolArray, FloatArray, taking_all_models
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, check, each_model
 from bwbayes.model.inputs import PIECE, Span, monotone_stretches
@@ -84,7 +84,8 @@ class HysteresisStep(ABC):
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return w, dw/du and the memory once the voltage has gone there; that given stays."""
         after = np.empty_like(memory)
-        return *self.move(self.parameters.T, memory.T, voltage, after.T), after
+        with taking_all_models(self):
+            return *self.move(self.parameters.T, memory.T, voltage, after.T), after
 
 
 class OneStateStep(HysteresisStep):
@@ -133,7 +134,8 @@ class OneStateStep(HysteresisStep):
         """
         numbers, memory = self.parameters.T[..., np.newaxis], self._at(start, state).T
         after = np.empty((*memory.shape, voltage.size))
-        w, _ = self.move(numbers, memory[..., np.newaxis], voltage, after)
+        with taking_all_models(self):
+            w, _ = self.move(numbers, memory[..., np.newaxis], voltage, after)
         return w, after[1]
 
 

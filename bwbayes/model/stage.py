@@ -14,16 +14,14 @@ with it, compiled it moves one after the other (:mod:`bwbayes.model.compiled`), 
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, taking_all_models
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.inputs import Hold, Inputs
@@ -120,24 +118,10 @@ class Stage(ABC):
     def settled(self, numbers: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models,) at rest at a value (models,), and the memory there."""
         memory = np.empty((self.remembers, value.size))
-        with self._taking_all_models():
+        with taking_all_models(self):
             if not self.remembers:
                 return np.asarray(self.move(numbers.T, memory, value, memory)), memory.T
             return np.asarray(self.settle(numbers.T, value, memory)), memory.T
-
-    @contextmanager
-    def _taking_all_models(self) -> Iterator[None]:
-        """Refuse a formula that is of one number: it has an ``if``, or a function of ``math``."""
-        try:
-            yield
-        except (TypeError, ValueError) as error:
-            if not re.search("truth value|Python scalars", str(error)):
-                raise
-            raise InputError(
-                f"{type(self).__module__}:{type(self).__qualname__}: its formula takes one number, "
-                "not all models at once; write bwbayes.arrays.select(condition, yes, no) in place "
-                "of if, and NumPy's functions in place of those of math"
-            ) from None
 
     def begin(
         self,
@@ -170,11 +154,11 @@ class Stage(ABC):
             known = [*numbers.T[..., np.newaxis]]
             if seen is not None:
                 known[len(known) - len(seen) :] = seen
-            with self._taking_all_models():
+            with taking_all_models(self):
                 return np.asarray(self.move(known, memory.T, values, memory.T)), memory
         result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
-        with self._taking_all_models():
+        with taking_all_models(self):
             for sample in range(values.shape[1]):
                 if seen is not None:
                     rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]
@@ -199,7 +183,7 @@ class Stage(ABC):
         self.require_inverse()
         result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
-        with self._taking_all_models():
+        with taking_all_models(self):
             for sample in range(values.shape[1]):
                 if seen is not None:
                     rows[len(rows) - len(seen) :] = seen[:, sample, np.newaxis]

@@ -12,12 +12,11 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, taking_all_models
 from bwbayes.model.declaration import Declaration, Distribution, Values, refuse
 from bwbayes.model.inputs import PIECE, Span, monotone_stretches
 from bwbayes.model.operator import HysteresisStep, Operator
@@ -106,7 +105,12 @@ class RemembersExtrema(Operator):
     def branch(self, column: Values) -> Branch:
         """Return the Everett function of the models."""
         numbers = np.ascontiguousarray(self.numbers(column).T)[:, :, np.newaxis]
-        return partial(self.everett, numbers)
+
+        def everett(start: Any, voltage: Any) -> Any:
+            with taking_all_models(self):
+                return self.everett(numbers, start, voltage)
+
+        return everett
 
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
