@@ -275,6 +275,29 @@ def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -
     assert f". Fix: lead_in_start = {finding.stop:.3g} under [validation.a]" in remark
 
 
+@pytest.mark.parametrize(
+    ("defect", "stage", "foreign"),
+    [
+        ("drift", "drift", True),
+        ("jump", "step", True),
+        ("switch-on transient", "transient", True),
+        ("late displacement", "delay", False),
+        ("reversed sign", "reversed-sign", False),
+    ],
+)
+def test_what_a_stage_takes_into_account_is_no_finding(
+    defect: str, stage: str, foreign: bool, tmp_path: Path
+) -> None:
+    """Its own remedy is said with the stage; another record has an event of its own."""
+    write_record(SPOILT[defect](looping(0), np.random.default_rng(0)), tmp_path / "record.h5")
+    text = '[record]\nfile = "record.h5"\n[validation.a]\nfile = "record.h5"\n[model]\nstages = '
+    for stages, expected in (([], (True, True)), ([stage], (False, foreign))):
+        run = of(f"{text}{stages}".replace("'", '"'), tmp_path)
+        kinds = [finding.kind for finding in findings_of(run.study)["record"]]
+        of_other = any(remark.startswith(f"a: {defect}: ") for remark in run.record_remarks)
+        assert (defect in kinds, of_other) == expected
+
+
 @pytest.mark.parametrize("lead_in", ["4.0", "100.0", "0.001"])
 def test_lead_in_that_is_no_part_of_the_record_is_refused_before_sampling(
     tmp_path: Path, lead_in: str

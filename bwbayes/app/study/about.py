@@ -13,6 +13,7 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running import fingerprint
 from bwbayes.diagnosis.consistency import conflicts, disagreements
+from bwbayes.diagnosis.defects import DEFECTS
 from bwbayes.diagnosis.explanations import TIED, likely_causes
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited_note
 from bwbayes.diagnosis.finding import Finding
@@ -92,7 +93,7 @@ def findings_of(study: Study) -> dict[str, tuple[Finding, ...]]:
         no_matter += UNTOLD
     if study.spec.operator.name == "linear":
         no_matter += tuple(kind for kind in UNTOLD if kind != "few readings")
-    no_matter += _followed_kinds(study)
+    followed = _followed_kinds(study, fitted=True)
     findings = {}
     for name, record in study.records.items():
         # Borders that differ by less than half a sample are the same.
@@ -104,6 +105,7 @@ def findings_of(study: Study) -> dict[str, tuple[Finding, ...]]:
             finding
             for finding in inspect(record)
             if finding.kind not in no_matter
+            and not finding.kind.startswith(followed)
             and any(finding.start < stop and start < finding.stop for start, stop in times)
         )
     return findings
@@ -136,9 +138,16 @@ def record_remarks(
     return tuple(remarks)
 
 
-def _followed_kinds(study: Study) -> tuple[str, ...]:
-    """Return the kinds of findings that the model itself takes into account."""
-    return ("late displacement", "late voltage") if "delay" in study.spec.chain else ()
+def _followed_kinds(study: Study, *, fitted: bool) -> tuple[str, ...]:
+    """Return how kinds of findings begin that a stage of the model takes into account.
+
+    In a ``fitted`` record, or in another: what is foreign to the actuator is that of its record.
+    """
+    return tuple(
+        defect.finding
+        for defect in DEFECTS.values()
+        if defect.finding and defect.stage in study.spec.chain and (fitted or not defect.foreign)
+    )
 
 
 def _unlike(name: str, record: Record, study: Study) -> Iterator[str]:
@@ -147,7 +156,7 @@ def _unlike(name: str, record: Record, study: Study) -> Iterator[str]:
         fix = finding.fix
         if finding.kind == "switch-on transient":  # nothing here is fitted
             fix = f"lead_in_start = {record.clock(finding.stop)} under [validation.{name}]"
-        if finding.kind not in UNTOLD + _followed_kinds(study):
+        if not finding.kind.startswith((*UNTOLD, *_followed_kinds(study, fitted=False))):
             yield f"{name}: {replace(finding, fix=fix)}"
 
 
