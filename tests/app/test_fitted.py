@@ -437,6 +437,7 @@ def test_every_object_shows_itself_in_a_dozen_lines(objects: list[Any]) -> None:
         assert len(text) <= LONGEST, type(thing)
 
 
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 def test_what_is_printed_is_still_whole(objects: list[Any]) -> None:
     fit = objects[0]
     assert len(str(fit).splitlines()) > MOST_LINES
