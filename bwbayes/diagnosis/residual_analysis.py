@@ -332,10 +332,11 @@ class ResidualAnalysis:
     def path_error_gain(self) -> float:
         """Gain in log evidence, nats, if the voltage's path were known exactly.
 
-        A stage in front of the hysteresis may gain as much by smoothing the path's error alone. For
-        a noisy voltage the gain is expected: the mean of ½ |W (x(v) − x(u))|² for paths v that are
-        estimated of the path u with new noise on it, W whitens the readings. Without noise it is
-        what the record gains from a path that reaches the corners between samples.
+        A stage in front of the hysteresis, or another hold, may gain as much by smoothing the
+        path's error alone. For a noisy voltage the gain is expected: the mean of
+        ½ |W (x(v) − x(u))|² for paths v that are estimated of the path u with new noise on it, W
+        whitens the readings. Without noise it is what the record gains from a path that reaches the
+        corners between samples.
         """
         whole, record = self.whole.single_record, self.posterior.single_record
         noise_sd = self.study.records[whole.name].path.noise_sd
@@ -500,7 +501,7 @@ class ResidualAnalysis:
             fix = f"state {statement}" if spec == self.study.spec else f"{fix}, with {statement}"
         if advice:
             fix = advice if any(flags.values()) else f"{advice}, or {fix}"
-        smooths = any(
+        smooths = "hold" in parts or any(
             stage.side == "input" and not stage.rate_independent
             for stage in posterior.single_record.actuator.stages
             if stage.name in {*spec.chain} - {*self.study.spec.chain}

@@ -604,7 +604,7 @@ def test_noise_on_the_voltage_is_no_late_voltage(seed: int, late: int, tmp_path:
 
 @pytest.mark.parametrize("late", [0.0, 0.03])
 def test_corners_between_samples_are_no_late_voltage(late: float, tmp_path: Path) -> None:
-    """What a sampled triangle lacks of its corners is no delay or lag; a late voltage is found.
+    """What a sampled triangle lacks of its corners is no delay, lag or hold; a late one is found.
 
     Without the corners' worth, which is the twin, 7 of 10 such records had a false cause.
     """
@@ -624,7 +624,7 @@ def test_corners_between_samples_are_no_late_voltage(late: float, tmp_path: Path
         study = study_of(REST.replace("from_rest = true\n", ""), tmp_path)
         optima = pointfit.fit(study.posterior, np.random.default_rng(seed)).optima
         found = explain(analysis_of(study, optima))
-        causes = [e for e in found if e.kind in ("delay", "amplifier lag")]
+        causes = [e for e in found if e.kind in ("delay", "amplifier lag", "hold")]
         nats.append(max(cause.nats for cause in causes))
         before.append(max(cause.nats + cause.cost for cause in causes))
     assert [worth > LIMIT for worth in nats] == [bool(late)] * len(nats)
