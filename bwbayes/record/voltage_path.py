@@ -17,6 +17,9 @@ and it has to be monotone between them:
    that their mean describes become this mean, or a parabola, where that is the more certain.
 5. Lines of the residual's spectrum, such as mains hum, move the actuator too: they are set aside
    before and added again. Hum of the monitor alone cannot be distinguished from them.
+
+A voltage without noise may lack the corners that fall between its samples: a sampled triangle does
+not reach its extremes. :func:`with_corners` is the path that does.
 """
 
 from __future__ import annotations
@@ -124,8 +127,8 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
 def with_corners(voltage: FloatArray) -> FloatArray:
     """Return a voltage (samples,), V, that reaches the corners between its samples.
 
-    Where two straight lines meet between two samples, the voltage turned further out than either of
-    them; the nearer one is moved there. A round extreme, as of a sine, stays as it is.
+    Where a rising and a falling line meet between two samples, the voltage turned further out than
+    either of them; the nearer one is moved there. A round extreme, as of a sine, stays as it is.
     """
     path = voltage.copy()
     slope = np.diff(voltage)
