@@ -23,7 +23,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import KINDS
 from bwbayes.diagnosis.laplace import LocalFit, climb
-from bwbayes.diagnosis.residual_analysis import Explanation, on_readings
+from bwbayes.diagnosis.residual_analysis import Explanation, of_readings, on_readings
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Study
 from bwbayes.watching import Watch, unwatched, watched
@@ -81,7 +81,8 @@ def alternatives(
     fits, log_odds = dict[str, LocalFit](), dict[str, float]()
     for cause in watched(counted, watch):
         assert cause.spec is not None
-        other = study.with_model(cause.spec, cause.stated).posterior
+        # One voltage may reach corners, where readings are left out, and another one not.
+        other = of_readings(study.with_model(cause.spec, cause.stated).posterior, study.posterior)
         # Climb from where it was fitted, and from the mode with its stage.
         starts = {**chosen.by_name, **cause.mode}, {**cause.mode, **chosen.by_name}
         values = [[start.get(name, 0.0) for name in other.names] for start in starts]

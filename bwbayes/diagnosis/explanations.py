@@ -102,8 +102,19 @@ def without(analysis: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explan
         yield analysis.explained(name, f"no {name}", fix, fit, spec=spec)
 
 
+def corners(analysis: ResidualAnalysis) -> Iterator[Explanation]:
+    """Try a voltage that reaches the corners between its samples, where it has any."""
+    record = analysis.study.records[analysis.whole.single_record.name]
+    other = replace(record, corners=True)
+    if record.corners or np.array_equal(other.path.voltage, record.path.voltage):
+        return
+    if analysis.whole.single_record.actuator.hold == "first":
+        yield from analysis.changed("corners", "voltage that turns between samples", hold="corners")
+
+
 def hold(analysis: ResidualAnalysis) -> Iterator[Explanation]:
-    """Try the other hold of the voltage between samples."""
+    """Try the other hold of the voltage between samples, and its corners there."""
+    yield from corners(analysis)
     other = "first" if analysis.whole.single_record.actuator.hold == "zero" else "zero"
     text = "voltage that is held between samples"
     if other == "first":

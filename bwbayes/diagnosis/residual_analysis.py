@@ -33,7 +33,7 @@ from bwbayes.inference.thinning import (
 from bwbayes.model.inputs import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
-from bwbayes.record.voltage_path import VoltagePath, with_corners
+from bwbayes.record.voltage_path import VoltagePath
 from bwbayes.shown import rounded
 from bwbayes.watching import Watch, unwatched
 
@@ -330,18 +330,16 @@ class ResidualAnalysis:
 
     @cached_property
     def path_error_gain(self) -> float:
-        """Gain in log evidence, nats, if the voltage's path were known exactly.
+        """Expected gain in log likelihood, nats, if the voltage's path were known exactly.
 
-        A stage in front of the hysteresis, or another hold, may gain as much by smoothing the
-        path's error alone. For a noisy voltage the gain is expected: the mean of
-        ½ |W (x(v) − x(u))|² for paths v that are estimated of the path u with new noise on it, W
-        whitens the readings. Without noise it is what the record gains from a path that reaches the
-        corners between samples.
+        A stage in front of the hysteresis may gain as much by smoothing the path's error alone. It
+        is the mean of ½ |W (x(v) − x(u))|² for paths v that are estimated of the path u with new
+        noise on it, W whitens the readings; 0 where the voltage has no noise.
         """
         whole, record = self.whole.single_record, self.posterior.single_record
         noise_sd = self.study.records[whole.name].path.noise_sd
         if not noise_sd:
-            return self._corner_gain
+            return 0.0
         path = VoltagePath(whole.voltage, noise_sd)
         theta = self.posterior.prior.theta(self.fit.free[np.newaxis])
 
@@ -357,22 +355,6 @@ class ResidualAnalysis:
             moved = white(replace(self.posterior, datasets=(changed,))) - white(self.posterior)
             worths.append(0.5 * float(np.sum(moved**2)))
         return float(np.mean(worths))
-
-    @property
-    def _corner_gain(self) -> float:
-        """Gain in log evidence, nats, from a voltage that reaches the corners between samples."""
-        whole, record = self.whole.single_record, self.posterior.single_record
-        inputs = replace(whole.inputs, voltage=with_corners(whole.voltage))
-        inputs = thin(replace(whole, inputs=inputs), self.stride).inputs
-        at_corner = inputs.voltage != record.voltage
-        if record.actuator.hold == "zero" or not at_corner.any():
-            return 0.0
-        # A reading is that of its sample, not of the corner beside it.
-        readings = np.where(at_corner, np.nan, record.displacement)
-        other = self.posterior.altered(inputs=inputs, displacement=readings)
-        before = on_readings(self.fit, other)
-        fit = climb(other, before.coordinates, watch=self.watch)
-        return max(fit.log_evidence - before.log_evidence, 0.0)
 
     @property
     def lead(self) -> float:
@@ -398,16 +380,18 @@ class ResidualAnalysis:
         """Return the posterior of another model and the same readings."""
         rebuilt, readings = self._of_whole(study), self.posterior.single_record.displacement
         posterior = replace(rebuilt, datasets=(thin(rebuilt.single_record, self.stride),))
-        if (
-            self.stride > 1
-            and rebuilt.single_record.actuator.hold != self.whole.single_record.actuator.hold
+        ours, theirs = self.whole.single_record, rebuilt.single_record
+        if self.stride > 1 and (
+            theirs.actuator.hold != ours.actuator.hold
+            or not np.array_equal(theirs.voltage, ours.voltage)
         ):
-            # The readings of a thinned record depend on the hold.
+            # The readings of a thinned record depend on the voltage's course between samples.
             theta = rebuilt.prior.theta(self.fit.free[np.newaxis])
             held = with_residuals_of(posterior, rebuilt, theta).single_record.displacement
             readings = np.where(np.isfinite(readings), held, np.nan)
         return posterior.altered(
-            displacement=readings, training=self.posterior.single_record.training
+            displacement=_common(readings, posterior.single_record.displacement),
+            training=self.posterior.single_record.training,
         ).known()
 
     def on_readings_of(self, posterior: Posterior) -> ResidualAnalysis:
@@ -420,7 +404,7 @@ class ResidualAnalysis:
     def _of_whole(self, study: Study) -> Posterior:
         """Return the posterior of another model of the whole record."""
         if self.alone:
-            return study.posterior
+            return of_readings(study.posterior, self.whole)
         # The reference values of the actuator's stages depend on the other records, too.
         stages = study.posterior.single_record.actuator.stages
         actuator = replace(self.whole.single_record.actuator, stages=stages)
@@ -501,7 +485,7 @@ class ResidualAnalysis:
             fix = f"state {statement}" if spec == self.study.spec else f"{fix}, with {statement}"
         if advice:
             fix = advice if any(flags.values()) else f"{advice}, or {fix}"
-        smooths = "hold" in parts or any(
+        smooths = any(
             stage.side == "input" and not stage.rate_independent
             for stage in posterior.single_record.actuator.stages
             if stage.name in {*spec.chain} - {*self.study.spec.chain}
@@ -587,6 +571,19 @@ def on_readings(fit: LocalFit, other: Posterior) -> LocalFit:
         return fit
     fewer = fit.posterior.altered(displacement=np.where(missing, np.nan, readings))
     return climb(fewer, fit.coordinates)
+
+
+def of_readings(posterior: Posterior, other: Posterior) -> Posterior:
+    """Return a posterior of one record without the readings that another one leaves out."""
+    readings = posterior.single_record.displacement
+    common = _common(readings, other.single_record.displacement)
+    return posterior if common is readings else posterior.altered(displacement=common)
+
+
+def _common(readings: FloatArray, others: FloatArray) -> FloatArray:
+    """Return readings (samples,), um, that others (samples,) have, too."""
+    missing = np.isnan(others) & np.isfinite(readings)
+    return np.where(missing, np.nan, readings) if missing.any() else readings
 
 
 def lines(before: ModelSpec, after: ModelSpec) -> str:

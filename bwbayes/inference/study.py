@@ -212,6 +212,16 @@ class Study:
     validations: Mapping[str, Validation] = field(default_factory=dict)
     seed: int = 1
 
+    def __post_init__(self) -> None:
+        reaches = self.spec.hold == "corners"
+        records = {name: _reaching(record, reaches) for name, record in self.records.items()}
+        validations = {
+            name: replace(other, record=other.record and _reaching(other.record, reaches))
+            for name, other in self.validations.items()
+        }
+        object.__setattr__(self, "records", records)
+        object.__setattr__(self, "validations", validations)
+
     @property
     def record(self) -> Record:
         """The record that is fitted; of several, the first."""
@@ -478,10 +488,16 @@ def generator(seed: int, purpose: str) -> np.random.Generator:
     return np.random.default_rng([seed, *purpose.encode()])
 
 
+def _reaching(record: Record, corners: bool) -> Record:
+    """Return a record whose path reaches its corners, or does not."""
+    return record if record.corners == corners else replace(record, corners=corners)
+
+
 def _readings(record: Record) -> FloatArray:
     """Return the displacement (samples,), um, of a record that has one."""
-    assert record.displacement is not None
-    return record.displacement
+    followed = record.followed
+    assert followed is not None
+    return followed
 
 
 def _values_of(stated: Mapping[str, Stated], record: str = "") -> dict[str, float | Distribution]:

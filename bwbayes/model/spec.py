@@ -70,7 +70,8 @@ class ModelSpec:
         In whatever order, one hysteresis operator among them; they are kept in that of the signal's
         way, those of the package before others in the same slot.
     hold
-        Course of the voltage between samples; ``"auto"`` takes it from the record.
+        Course of the voltage between samples; ``"auto"`` takes it from the record, and so does
+        ``"corners"``, with which straight lines meet where they turn.
     history
         The drive before a record: ``"unknown"``, any over the voltages of the record, or
         ``"demagnetized"``, a voltage straight from 0 V.
@@ -238,7 +239,7 @@ class ModelSpec:
             times = creep_times(extent.shortest, extent.longest)
         return Actuator(
             keys["dynamics"],
-            hold if self.hold == "auto" else self.hold,  # type: ignore[arg-type]  # refuses others
+            hold if self.hold in ("auto", "corners") else self.hold,  # type: ignore[arg-type]  # refuses others
             interval,
             build_part(
                 "model.hysteresis",
@@ -265,7 +266,8 @@ class ModelSpec:
         parts += keys["stages"]
         if self.history == "demagnetized":
             parts.append("demagnetized before the record")
-        return f"{', '.join(parts)}, dynamics {keys['dynamics']}, {self.hold} hold"
+        course = "corners between samples" if self.hold == "corners" else f"{self.hold} hold"
+        return f"{', '.join(parts)}, dynamics {keys['dynamics']}, {course}"
 
 
 def _creep(times: Any, growth: bool) -> StageSpec:

@@ -189,7 +189,9 @@ def continue_record(record: Record, voltage: FloatArray) -> Record:
 
     Its covariates are unknown from there on.
     """
-    full_voltage = np.concatenate([record.path.voltage, voltage])
+    # Corners are looked for anew.
+    before = record.path.voltage if record.path.noise_sd else record.voltage
+    full_voltage = np.concatenate([before, voltage])
     return replace(record, voltage=full_voltage, covariates={}, displacement=None, truth=None)
 
 
@@ -235,7 +237,9 @@ def predict_record(
         # Only those readings count that the draws can follow.
         actuator = replace(posterior.single_record.actuator, interval=record.interval)
         model = posterior.single_record.table.actuator(theta)
-        known = actuator.known(model, record.displacement, from_rest=start.from_rest)
+        followed = record.followed
+        assert followed is not None
+        known = actuator.known(model, followed, from_rest=start.from_rest)
         if known is not record.displacement:
             record = replace(record, displacement=known)
     start_states = estimate_initial_states(

@@ -28,7 +28,7 @@ from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.grid import clock
 from bwbayes.record.io.recognition import QUANTITIES
 from bwbayes.record.io.series import Source, array_source, frame_source
-from bwbayes.record.voltage_path import VoltagePath, estimate_path
+from bwbayes.record.voltage_path import VoltagePath, estimate_path, with_corners
 from bwbayes.shown import brief
 
 Window = tuple[float, float]
@@ -65,6 +65,8 @@ class Record(Inputs):
         sample: the time stamp of time zero.
     instruments : Instruments
         Uncertainties of the scales of sensor and voltage monitor.
+    corners : bool
+        Whether a model's voltage reaches the corners that fall between samples.
     read_as : dict
         Names in the file that it was read from: of its ``columns`` by quantity, ``all_columns``.
 
@@ -89,6 +91,7 @@ class Record(Inputs):
     truth: FloatArray | None = None
     time_offset: float = 0.0
     instruments: Instruments = EXACT
+    corners: bool = False
     read_as: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -247,11 +250,27 @@ class Record(Inputs):
     def path(self) -> VoltagePath:
         """The voltage that drives a model: the measured one without its noise.
 
-        A command, and a planned voltage without a displacement, have no noise.
+        A command, and a planned voltage without a displacement, have no noise. A voltage without
+        noise, but no command, may reach its ``corners``.
         """
-        if self.voltage_is == "command" or self.displacement is None:
-            return VoltagePath(self.voltage)
-        return estimate_path(self.voltage)
+        path = VoltagePath(self.voltage)
+        if self.voltage_is == "command":
+            return path
+        if self.displacement is not None:
+            path = estimate_path(self.voltage)
+        if self.corners and not path.noise_sd:
+            path = replace(path, voltage=with_corners(self.voltage))
+        return path
+
+    @property
+    def followed(self) -> FloatArray | None:
+        """The displacement (samples,), um, that a model of the path can follow; else it is nan.
+
+        Where the path reaches a corner, a reading is that of the sample beside it.
+        """
+        if not self.corners or self.displacement is None or self.path.noise_sd:
+            return self.displacement
+        return np.where(self.path.voltage == self.voltage, self.displacement, np.nan)
 
     @cached_property
     def inputs(self) -> Inputs:
@@ -312,7 +331,7 @@ class Record(Inputs):
         return digest.hexdigest()
 
     def like(self, other: Record) -> Record:
-        """Return the record with the quantities, units and instruments of another record.
+        """Return the record with quantities, units, instruments and corners as another has them.
 
         Raises
         ------
@@ -331,7 +350,9 @@ class Record(Inputs):
                 f"{self.origin}: is of {own.input} and {own.output}, not of {theirs.input} and "
                 f"{theirs.output}; state these as its input and output"
             )
-        return replace(self, quantities=theirs, instruments=other.instruments)
+        return replace(
+            self, quantities=theirs, instruments=other.instruments, corners=other.corners
+        )
 
     def window_slice(self, start: float, stop: float) -> slice:
         """Return the slice of the samples with start <= time < stop.

@@ -132,16 +132,16 @@ def with_corners(voltage: FloatArray) -> FloatArray:
     """
     path = voltage.copy()
     slope = np.diff(voltage)
-    bend = np.diff(slope)
-    # Of the line up to sample k and the one from k + 1 on; both go through another sample.
-    before, between, after = slope[1:-3], slope[2:-2], slope[3:-1]
+    # Of the line up to sample k + 1 and the one from k + 2 on; both go through another sample.
+    before, between, after = slope[:-2], slope[1:-1], slope[2:]
     turn = before - after
-    straight = np.maximum(np.abs(bend[:-3]), np.abs(bend[3:])) < STRAIGHT * np.abs(turn)
+    bend = np.pad(np.abs(np.diff(slope)), 1)  # beyond the ends, lines are as straight as can be
+    straight = np.maximum(bend[:-3], bend[3:]) < STRAIGHT * np.abs(turn)
     with np.errstate(divide="ignore", invalid="ignore"):
         fraction = (between - after) / turn
     (k,) = np.nonzero((before * after < 0) & straight & (fraction > 0) & (fraction < 1))
-    nearest = k + 2 + (fraction[k] > 0.5)
-    corner = voltage[k + 2] + before[k] * fraction[k]
+    nearest = k + 1 + (fraction[k] > 0.5)
+    corner = voltage[k + 1] + before[k] * fraction[k]
     # Rounding may show one corner on both sides of a sample: the further one is assigned last.
     order = np.argsort(np.abs(corner - voltage[nearest]))
     path[nearest[order]] = corner[order]

@@ -34,6 +34,7 @@ from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import plant
+from tests.diagnosis.test_explanations import triangle_record
 from tests.stand import Stand, autoregressive, play
 from tests.test_sampling_rates import records
 
@@ -64,6 +65,40 @@ def test_a_search_that_adds_many_stages_and_leaves_an_error_has_not_found_the_me
     assert unexplained > explaining.MAX_DISCREPANCY
     assert parse(dump(chosen.config), "again").model.unexplained == unexplained
     assert len(chosen.config.records["record"].remarks or []) == 1
+
+
+def test_a_sampled_triangle_turns_between_its_samples(tmp_path: Path) -> None:
+    """The search takes its corners first, and no stage for what the samples lack of them.
+
+    The config says so; the next record's path reaches its corners, too, and no reading is held
+    against the path there.
+    """
+    record, following = triangle_record(1), triangle_record(2)
+    write_record(record, tmp_path / "record.h5")
+    write_record(following, tmp_path / "next.h5")
+    text = '[record]\nfile = "record.h5"\n[validation.next]\nfile = "next.h5"\n'
+    chosen = choose_model(resolve_config(parse(text, "my.toml"), tmp_path))
+    study = chosen.run.study
+    assert (study.spec.chain, study.spec.hold) == (("bouc-wen", "lag"), "corners")
+    (step, *_) = chosen.steps
+    assert step.startswith("added: voltage that turns between samples (")
+    assert parse(dump(chosen.run.config), "again").model.spec.hold == "corners"
+    readings = study.posterior.single_record.readings
+    assert readings.rows.size < record.readings
+    draws = np.repeat(study.posterior.prior.constrain(chosen.point.optima[:1])[0], 40, axis=0)
+    other = study.validations["next"]
+    assert other.record is not None
+    bands = predict_record(
+        study.posterior, draws, other.record, other.start, np.random.default_rng(1)
+    )
+    assert np.max(bands.voltage) > np.max(following.voltage)
+    measured = bands.measured
+    assert measured is not None
+    scored = slice(bands.scored_from, None)
+    missed = np.abs(measured - bands.mean)[scored]
+    assert np.nanmax(missed) < 0.06
+    moved = bands.voltage != following.voltage
+    assert np.array_equal(np.isnan(missed), moved[scored])
 
 
 @pytest.mark.usefixtures("_without_pictures")

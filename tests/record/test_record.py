@@ -380,3 +380,26 @@ def test_readings_say_nothing_of_the_scales(name: str) -> None:
         results.append(actuator.displacement(columns, voltage, from_rest=True))
     expected, found = results
     np.testing.assert_allclose(1.3 * expected, found, rtol=1e-6, atol=1e-6 * np.ptp(expected))
+
+
+def test_a_path_that_reaches_corners_leaves_out_the_readings_there() -> None:
+    """A command has no corners between samples; a new record has those of the one it is like."""
+    time = np.arange(60) / 10
+    voltage = np.interp(time, [0.0, 1.53, 3.07, 4.62, 6.0], [0.0, 30.0, -30.0, 30.0, 0.0])
+    record = Record(voltage, 0.1 * voltage, interval=0.1)
+    assert np.array_equal(record.path.voltage, voltage)
+    assert record.followed is record.displacement
+    reached = replace(record, corners=True)
+    turned = reached.path.voltage != voltage
+    assert [15, 31, 46] == np.flatnonzero(turned).tolist()
+    np.testing.assert_allclose(reached.path.voltage[turned], [30.0, -30.0, 30.0])
+    assert np.array_equal(reached.inputs.voltage, reached.path.voltage)
+    assert reached.followed is not None
+    assert np.array_equal(np.isnan(reached.followed), turned)
+    assert np.array_equal(reached.voltage, voltage)
+    planned = Record(voltage, None, interval=0.1).like(reached)
+    assert np.array_equal(planned.path.voltage, reached.path.voltage)
+    command = replace(reached, voltage_is="command")
+    assert np.array_equal(command.path.voltage, voltage)
+    assert command.followed is not None
+    assert np.isfinite(command.followed).all()

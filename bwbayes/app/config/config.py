@@ -34,6 +34,7 @@ from bwbayes.app.config import MAX_SEED
 from bwbayes.app.config.keys import ConfigTable, Positive, Texts, key, one_line
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference import EngineChoice
+from bwbayes.model.inputs import Hold
 from bwbayes.model.registry import OPTIONS
 from bwbayes.model.spec import ModelSpec
 
@@ -234,9 +235,9 @@ class ActuatorConfig(ConfigTable):
 class ModelConfig(ActuatorConfig):
     """The model: an actuator, and what is read of it."""
 
-    hold: Literal["auto", "first", "zero"] = key("auto", example='"zero"')
+    hold: Literal["auto", "first", "zero", "corners"] = key("auto", example='"zero"')
     """How the voltage goes between samples: in straight lines (first), held (zero), or held if it
-    is a command (auto).
+    is a command (auto); straight lines that meet between samples, where it turns (corners).
     """
     history: Literal["unknown", "demagnetized"] = key("unknown", example='"demagnetized"')
     """The drive before the record: any over the record's voltages (unknown), or a voltage
@@ -264,6 +265,14 @@ class ModelConfig(ActuatorConfig):
         """The model that it describes; where the noise is open, the one that claims least."""
         spec = super().spec
         return replace(spec, noise="discrepancy") if spec.noise == "auto" else spec
+
+    @property
+    def stated_hold(self) -> Hold | None:
+        """The hold of other records, too; None where each has its own."""
+        match self.hold:
+            case "first" | "zero":
+                return self.hold
+        return None
 
     @property
     def search_seconds(self) -> float:

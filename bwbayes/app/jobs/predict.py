@@ -606,11 +606,8 @@ def predict(
             )
     record = record.like(study.records[of])
     record = record.without_values(fit.config.records[of].missing or ())
-    hold = fit.config.model.hold
-    declared_hold = None if hold == "auto" else hold
-    start = InitialConditions(
-        from_rest, estimate_offset, lead_in, lead_in_start, declared_hold, after
-    )
+    hold = fit.config.model.stated_hold
+    start = InitialConditions(from_rest, estimate_offset, lead_in, lead_in_start, hold, after)
     other = Validation((), record, start, window, of)
     prediction = predict_another(fit, other, name or "prediction", watching, held_out)
     is_said = any("--from-rest" in remark for remark in prediction.remarks)

@@ -24,7 +24,14 @@ from bwbayes.app.running.fingerprint import fingerprint, load, save
 from bwbayes.app.study.resolve import with_model
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.averaging import Alternative, alternatives, remarks
-from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes, without
+from bwbayes.diagnosis.explanations import (
+    TIED,
+    corners,
+    explain,
+    followed_causes,
+    likely_causes,
+    without,
+)
 from bwbayes.diagnosis.finding import TELLING_DRIVE
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
@@ -187,7 +194,8 @@ def choose_model(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
     Each round fits the model, chooses the noise for it, explains its readings better in every way
     there is, and takes the stage that leads; then it leaves out again what was added and is not
     needed any more. So noise and stages cannot keep each other from being found, and the search
-    ends with a model that no stage would explain better. No stage is added with which the error on
+    ends with a model that no stage would explain better. The voltage's corners between its samples
+    come before any stage, which might make up for them. No stage is added with which the error on
     readings that were held out grows by a tenth, whatever its evidence. Several records have none
     added: an explanation is one of a single record. Time is CPU time without that of compiling, so
     that a busy or a new machine finds the same. A search that adds three stages and leaves a model
@@ -214,7 +222,9 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
     while not is_over:
         step = partial(watch, f"stages, round {len(steps) + 1}")
         analysis = _analysis(run.study, name, point.optima)
-        explanations = explain(analysis, step, lambda: clock() > seconds)
+        # The course of the voltage comes first: stages that smooth it would make up for corners.
+        turning = _turning(analysis)
+        explanations = turning or explain(analysis, step, lambda: clock() > seconds)
         is_over = clock() > seconds
         # The last one has just been weighed.
         before = [] if is_over else [*notes][:-1]
@@ -226,7 +236,7 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
             if cause.spec
             and not (is_open and not cause.stated and _reopened(cause.spec) == open_run.study.spec)
         ]
-        parts = likely_causes([cause for cause in models if not cause.misleads])
+        parts = turning or likely_causes([cause for cause in models if not cause.misleads])
         if needless:
             chosen = max(needless, key=lambda removal: removal.nats)
             del notes[chosen.kind], ties[chosen.kind]
@@ -235,8 +245,8 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
             # A tie goes to a stage before another hold, then to the fewest parameters.
             chosen = min(parts, key=partial(_size, run.study))
             assert chosen.spec is not None
-            new = [stage for stage in chosen.spec.chain if stage not in run.study.spec.chain]
-            added = (*new, chosen.kind)[0]
+            chain = run.study.spec.chain
+            added = next((new for new in chosen.spec.chain if new not in chain), chosen.kind)
             gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
             notes[added], note = f"stage added: {gain}{_fix(parts)}", f"added: {gain}"
             ties[added] = chosen.spec, [cause for cause in parts if cause is not chosen]
@@ -252,9 +262,11 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
     steps += [f"not added: {cause.text} ({cause.worth})" for cause in refused]
     ended = [f"the search for stages ended after {seconds:g} s, before it was complete"] * is_over
     unexplained, alarms = _unexplained(
-        len(notes), _relative_discrepancy(run.study.posterior, point)
+        len({*notes} - {"corners"}), _relative_discrepancy(run.study.posterior, point)
     )
     spec = run.study.spec
+    # A hold that was chosen later has no corners.
+    said = [note for kind, note in notes.items() if kind != "corners" or spec.hold == kind]
     tied = [*_tied(spec, ties.values())]
     weigh = partial(watch, "models that were not chosen")
     others = alternatives(run.study, point.optima, (*explanations, *tied), weigh)
@@ -262,13 +274,19 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
     run = with_model(
         run,
         spec,
-        remarks=[*notes.values(), *ended, *alarms, *remarks(others)],
+        remarks=[*said, *ended, *alarms, *remarks(others)],
         stages=spec.keys["stages"],
         unexplained=unexplained,
         tied=[spec.changes_to(other.spec) for other in tied if other.spec],
     )
     found = None if is_over else {name: explanations}
     return ChosenModel(run, point, (*steps, *why), found, others)
+
+
+def _turning(analysis: ResidualAnalysis) -> tuple[Explanation, ...]:
+    """Return the voltage's corners between samples, if all readings have evidence for them."""
+    found = (analysis.confirmed(cause) for cause in corners(analysis))
+    return tuple(cause for cause in found if cause.nats > TIED)
 
 
 def _unexplained(added: int, discrepancy: float) -> tuple[float | None, list[str]]:

@@ -406,9 +406,8 @@ def validations_of(
             record = _measure(stand, source.signal, generator(config.seed, f"record {name}"))
         if source.file is None or name in in_memory:
             _require_usable(record, table)
-        # Its hold is its own, unless given.
-        hold = None if config.model.hold == "auto" else config.model.hold
         lead_in = source.lead_in, source.lead_in_start
+        hold = config.model.stated_hold  # its own, unless given
         start = InitialConditions(source.from_rest, source.estimate_offset, *lead_in, hold)
         judged, key = None, "lead_in: "
         try:
