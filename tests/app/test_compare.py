@@ -138,6 +138,7 @@ def test_what_cannot_be_compared_is_one_line(fits: tuple[Run, Run]) -> None:
     [
         (measured(0.35), {}, "different records, or in different units"),
         (measured(), {"train": (0, 3)}, "fitted to different windows"),
+        (measured(), {"hold": "corners"}, "one alone reaches the corners between its samples"),
         (measured(), {"validation": {}}, r"differ in what is held out \(later\)"),
     ],
 )

@@ -129,6 +129,9 @@ def compare_models(
     folders: dict[str, RunFolder] = {}
     with ProgressLine(console, f"reading records for {len(models)} models ...", announced=False):
         runs = resolve_models(config, where, models, in_memory or {})
+        first, *others = runs
+        for name in others:
+            _require_same(f"compare: {first} and {name}", runs[first].study, runs[name].study)
         for name, run in runs.items():
             folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
             folders[name] = _folder(out / folder, run, overwrite)
@@ -175,6 +178,11 @@ def _require_same(pair: str, first: Study, other: Study) -> None:
         raise InputError(
             f"{pair}: fitted to different records, or in different units; compare fits of one "
             "record, with the same readings left out"
+        )
+    if "corners" in {first.spec.hold, other.spec.hold} and first.spec.hold != other.spec.hold:
+        raise InputError(
+            f"{pair}: the voltage of one alone reaches the corners between its samples, where "
+            'readings are left out; give both the same hold, "corners" or another, in [model]'
         )
     windows, held_out = [], []
     for study in (first, other):
