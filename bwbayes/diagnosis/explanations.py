@@ -109,7 +109,8 @@ def corners(analysis: ResidualAnalysis) -> Iterator[Explanation]:
     if record.corners or np.array_equal(other.path.voltage, record.path.voltage):
         return
     if analysis.whole.single_record.actuator.hold == "first":
-        yield from analysis.changed("corners", "voltage that turns between samples", hold="corners")
+        words = "voltage whose reversals fall between samples", "sample the voltage faster"
+        yield from analysis.changed("corners", lambda _: words, hold="corners")
 
 
 def hold(analysis: ResidualAnalysis) -> Iterator[Explanation]:

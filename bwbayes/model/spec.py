@@ -71,7 +71,7 @@ class ModelSpec:
         way, those of the package before others in the same slot.
     hold
         Course of the voltage between samples; ``"auto"`` takes it from the record, and so does
-        ``"corners"``, with which straight lines meet where they turn.
+        ``"corners"``, with which straight lines meet at reversals between samples.
     history
         The drive before a record: ``"unknown"``, any over the voltages of the record, or
         ``"demagnetized"``, a voltage straight from 0 V.

@@ -81,7 +81,7 @@ def test_a_sampled_triangle_turns_between_its_samples(tmp_path: Path) -> None:
     study = chosen.run.study
     assert (study.spec.chain, study.spec.hold) == (("bouc-wen", "lag"), "corners")
     (step, *_) = chosen.steps
-    assert step.startswith("added: voltage that turns between samples (")
+    assert step.startswith("added: voltage whose reversals fall between samples (")
     assert parse(dump(chosen.run.config), "again").model.spec.hold == "corners"
     readings = study.posterior.single_record.readings
     assert readings.rows.size < record.readings

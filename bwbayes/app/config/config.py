@@ -237,7 +237,7 @@ class ModelConfig(ActuatorConfig):
 
     hold: Literal["auto", "first", "zero", "corners"] = key("auto", example='"zero"')
     """How the voltage goes between samples: in straight lines (first), held (zero), or held if it
-    is a command (auto); straight lines that meet between samples, where it turns (corners).
+    is a command (auto); straight lines that meet between samples at reversals (corners).
     """
     history: Literal["unknown", "demagnetized"] = key("unknown", example='"demagnetized"')
     """The drive before the record: any over the record's voltages (unknown), or a voltage
