@@ -66,7 +66,8 @@ class Record(Inputs):
     instruments : Instruments
         Uncertainties of the scales of sensor and voltage monitor.
     corners : bool
-        Whether a model's voltage reaches the corners that fall between samples.
+        Whether a model's voltage reaches the corners that fall between samples; the model's
+        ``hold`` decides.
     read_as : dict
         Names in the file that it was read from: of its ``columns`` by quantity, ``all_columns``.
 
