@@ -495,9 +495,9 @@ def _reaching(record: Record, corners: bool) -> Record:
 
 def _readings(record: Record) -> FloatArray:
     """Return the displacement (samples,), um, of a record that has one."""
-    followed = record.followed
-    assert followed is not None
-    return followed
+    usable = record.usable_displacement
+    assert usable is not None
+    return usable
 
 
 def _values_of(stated: Mapping[str, Stated], record: str = "") -> dict[str, float | Distribution]:

@@ -237,9 +237,9 @@ def predict_record(
         # Only those readings count that the draws can follow.
         actuator = replace(posterior.single_record.actuator, interval=record.interval)
         model = posterior.single_record.table.actuator(theta)
-        followed = record.followed
-        assert followed is not None
-        known = actuator.known(model, followed, from_rest=start.from_rest)
+        usable = record.usable_displacement
+        assert usable is not None
+        known = actuator.known(model, usable, from_rest=start.from_rest)
         if known is not record.displacement:
             record = replace(record, displacement=known)
     start_states = estimate_initial_states(

@@ -264,7 +264,7 @@ class Record(Inputs):
         return path
 
     @property
-    def followed(self) -> FloatArray | None:
+    def usable_displacement(self) -> FloatArray | None:
         """The displacement (samples,), um, that a model of the path can follow; else it is nan.
 
         Where the path reaches a corner, a reading is that of the sample beside it.

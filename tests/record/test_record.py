@@ -388,18 +388,18 @@ def test_a_path_that_reaches_corners_leaves_out_the_readings_there() -> None:
     voltage = np.interp(time, [0.0, 1.53, 3.07, 4.62, 6.0], [0.0, 30.0, -30.0, 30.0, 0.0])
     record = Record(voltage, 0.1 * voltage, interval=0.1)
     assert np.array_equal(record.path.voltage, voltage)
-    assert record.followed is record.displacement
+    assert record.usable_displacement is record.displacement
     reached = replace(record, corners=True)
     turned = reached.path.voltage != voltage
     assert [15, 31, 46] == np.flatnonzero(turned).tolist()
     np.testing.assert_allclose(reached.path.voltage[turned], [30.0, -30.0, 30.0])
     assert np.array_equal(reached.inputs.voltage, reached.path.voltage)
-    assert reached.followed is not None
-    assert np.array_equal(np.isnan(reached.followed), turned)
+    assert reached.usable_displacement is not None
+    assert np.array_equal(np.isnan(reached.usable_displacement), turned)
     assert np.array_equal(reached.voltage, voltage)
     planned = Record(voltage, None, interval=0.1).like(reached)
     assert np.array_equal(planned.path.voltage, reached.path.voltage)
     command = replace(reached, voltage_is="command")
     assert np.array_equal(command.path.voltage, voltage)
-    assert command.followed is not None
-    assert np.isfinite(command.followed).all()
+    assert command.usable_displacement is not None
+    assert np.isfinite(command.usable_displacement).all()
