@@ -60,7 +60,7 @@ def test_a_voltage_reaches_its_corners_between_samples(
     """At corners as far apart as 5 samples, of lines of any two slopes, and in any unit.
 
     The nearest sample is at the corner then, and no other one has moved. Read backwards, the
-    voltage has the same corners; one that has reached them is left as it is.
+    voltage has the same corners.
     """
     times = first + np.cumsum([0.0, *spans])
     slopes = np.resize([1.0, -ratio], len(spans))
