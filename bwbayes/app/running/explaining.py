@@ -223,8 +223,8 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
         step = partial(watch, f"stages, round {len(steps) + 1}")
         analysis = _analysis(run.study, name, point.optima)
         # The course of the voltage comes first: stages that smooth it would make up for corners.
-        turning = _turning(analysis)
-        explanations = turning or explain(analysis, step, lambda: clock() > seconds)
+        corner_causes = _corner_causes(analysis)
+        explanations = corner_causes or explain(analysis, step, lambda: clock() > seconds)
         is_over = clock() > seconds
         # The last one has just been weighed.
         before = [] if is_over else [*notes][:-1]
@@ -236,7 +236,7 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
             if cause.spec
             and not (is_open and not cause.stated and _reopened(cause.spec) == open_run.study.spec)
         ]
-        parts = turning or likely_causes([cause for cause in models if not cause.misleads])
+        parts = corner_causes or likely_causes([cause for cause in models if not cause.misleads])
         if needless:
             chosen = max(needless, key=lambda removal: removal.nats)
             del notes[chosen.kind], ties[chosen.kind]
@@ -283,7 +283,7 @@ def _search(open_run: Run, clock: Callable[[], float], watch: WatchSteps) -> Cho
     return ChosenModel(run, point, (*steps, *why), found, others)
 
 
-def _turning(analysis: ResidualAnalysis) -> tuple[Explanation, ...]:
+def _corner_causes(analysis: ResidualAnalysis) -> tuple[Explanation, ...]:
     """Return the voltage's corners between samples, if all readings have evidence for them."""
     found = (analysis.confirmed(cause) for cause in corners(analysis))
     return tuple(cause for cause in found if cause.nats > TIED)
